@@ -1,0 +1,167 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The rig: mirror, camera and mounting; from pixels to rays in base_link and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from nccs_pose.errors import GeometryError
+from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.geometry.mirror import QuadricMirror
+from nccs_pose.geometry.pose import Array, checked_rotation, RigidTransform
+from nccs_pose.geometry.projection import reflect_points
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Reflected rays in base_link, one per pixel, and how they turn with the pixel.
+
+    :ivar direction: unit direction r (N, 3), away from the mirror.
+    :ivar moment: Plücker moment w = m x r (N, 3), metres, with m the mirror point.
+    :ivar direction_jacobian: dr/d(u, v) (N, 3, 2).
+    :ivar moment_jacobian: dw/d(u, v) (N, 3, 2).
+    :ivar hit: whether the pixel sees the mirror (N,); where not, the rest is zero.
+    """
+
+    direction: Array
+    moment: Array
+    direction_jacobian: Array
+    moment_jacobian: Array
+    hit: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.hit)
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Rays:
+        return Rays(
+            self.direction[index], self.moment[index], self.direction_jacobian[index],
+            self.moment_jacobian[index], self.hit[index])
+
+    def floor_points(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Where the rays meet the ground z = 0 of base_link.
+
+        With r x w = m - (m . r) r, the foot of the ray, it is found without m itself.
+
+        :returns: points (N, 2) in metres, zero where there is none, and which rays reach (N,).
+        """
+        r, w = self.direction, self.moment
+        reaches = self.hit & (r[:, 2] < -1e-9)
+        rz = np.where(reaches, r[:, 2], -1.0)
+        # w = p x r with p_z = 0 gives w_x = p_y r_z and w_y = -p_x r_z.
+        points = np.stack([-w[:, 1] / rz, w[:, 0] / rz], axis=1)
+        return np.where(reaches[:, None], points, 0.0), reaches
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A non-central catadioptric camera on a robot.
+
+    :ivar mirror: the quadric, in its own frame.
+    :ivar camera: the perspective camera.
+    :ivar cop: centre of projection o = (0, o_y, o_z) in the mirror frame (3,), metres.
+    :ivar R_mirror_camera: turns optical-frame directions into the mirror frame (3, 3).
+    :ivar T_base_mirror: the mounting on the robot.
+    :raises GeometryError: if the camera is inside the mirror, off the plane x = 0, or cannot
+        see the mirror.
+    """
+
+    mirror: QuadricMirror
+    camera: PinholeCamera
+    cop: Array
+    R_mirror_camera: Array
+    T_base_mirror: RigidTransform
+
+    def __post_init__(self) -> None:
+        cop = np.array(self.cop, dtype=float)
+        if cop.shape != (3,) or not np.isfinite(cop).all():
+            raise GeometryError(f'cop {cop.tolist()} is not three finite numbers')
+        if cop[0] != 0.0:
+            raise GeometryError(
+                f'cop {cop.tolist()}: its x must be 0 (turn the mirror frame about its axis)')
+        if self.mirror.encloses(cop):
+            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
+        object.__setattr__(self, 'cop', cop)
+        object.__setattr__(self, 'R_mirror_camera', checked_rotation(self.R_mirror_camera))
+        camera = self.camera
+        u, v = np.meshgrid(
+            np.linspace(0.0, camera.width - 1.0, 48), np.linspace(0.0, camera.height - 1.0, 36))
+        if not self.mirror_points(np.stack([u.ravel(), v.ravel()], axis=1))[1].any():
+            raise GeometryError(
+                f'the camera at {cop.tolist()} does not see the mirror: no pixel of its image '
+                'back-projects onto it')
+
+    def scaled(self, factor: float) -> Rig:
+        """The same rig with its camera read out at another resolution."""
+        return replace(self, camera=self.camera.scaled(factor))
+
+    def mirror_points(self, pixels: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Mirror points m (N, 3) in the mirror frame of pixels (N, 2), and which hit (N,)."""
+        directions = self.camera.directions(np.asarray(pixels, dtype=float))
+        return self.mirror.intersect(self.cop, directions @ self.R_mirror_camera.T)
+
+    def back_project(self, pixels: ArrayLike) -> Rays:
+        """Reflected rays in base_link of pixels (N, 2), with exact derivatives by the pixel.
+
+        Incident ray v, mirror point m, normal n, reflected ray r = v - 2 n (v.n)/(n.n)
+        (the paper's eqs. 8 to 10).
+        """
+        v, dv = self.camera.directions_with_jacobian(np.asarray(pixels, dtype=float))
+        v = v @ self.R_mirror_camera.T
+        dv = np.matmul(self.R_mirror_camera, dv)
+        m, hit = self.mirror.intersect(self.cop, v)
+        n = self.mirror.normal(m)
+        # Rows that miss are computed with harmless numbers and blanked at the end.
+        vn = np.where(hit, np.einsum('ni,ni->n', v, n), 1.0)
+        nn = np.where(hit, np.einsum('ni,ni->n', n, n), 1.0)
+        r = v - (2.0 * vn / nn)[:, None] * n
+        # m = o + t v stays on the surface: n . dm = 0.
+        t = np.linalg.norm(m - self.cop, axis=1)
+        along = np.einsum('ni,nij->nj', n, dv) / vn[:, None]
+        dm = t[:, None, None] * (dv - v[:, :, None] * along[:, None, :])
+        dn = dm.copy()
+        dn[:, 2] *= self.mirror.A
+        d_vn = np.einsum('ni,nij->nj', n, dv) + np.einsum('ni,nij->nj', v, dn)
+        d_nn = 2.0 * np.einsum('ni,nij->nj', n, dn)
+        k = vn / nn
+        dk = (d_vn - k[:, None] * d_nn) / nn[:, None]
+        dr = dv - 2.0 * (n[:, :, None] * dk[:, None, :] + k[:, None, None] * dn)
+        return self._rays_in_base(m, dm, r, dr, hit)
+
+    def _rays_in_base(
+        self, m: Array, dm: Array, r: Array, dr: Array, hit: NDArray[np.bool_],
+    ) -> Rays:
+        rotation = self.T_base_mirror.rotation
+        m, r = self.T_base_mirror.apply(m), self.T_base_mirror.rotate(r)
+        dm, dr = np.matmul(rotation, dm), np.matmul(rotation, dr)
+        w = np.cross(m, r)
+        dw = np.cross(dm, r[:, :, None], axis=1) + np.cross(m[:, :, None], dr, axis=1)
+        if not hit.all():
+            for array in (r, w, dr, dw):
+                array[~hit] = 0.0
+        return Rays(r, w, dr, dw, hit)
+
+    def project(self, points: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (N, 2) of points (N, 3) in base_link, and which are seen in the image (N,).
+
+        Rows that are not seen are zero where the mirror or the camera cannot show the point.
+        """
+        in_mirror = self.T_base_mirror.inverse().apply(points)
+        m, visible = reflect_points(self.mirror, self.cop, in_mirror)
+        pixels, in_front = self.camera.project((m - self.cop) @ self.R_mirror_camera)
+        seen = visible & in_front
+        return np.where(seen[:, None], pixels, 0.0), seen & self.camera.contains(pixels)
