@@ -1,0 +1,198 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The rig and the map as YAML files that a person writes by hand.
+
+Lengths are metres, angles radians. A wrong key or value is refused by name; what the geometry
+itself refuses (a camera inside the mirror, a line of no length) is refused with the file and key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from nccs_pose.errors import GeometryError
+from nccs_pose.files.text_files import write_text
+from nccs_pose.files.yaml_sections import read_yaml, Section
+from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.geometry.lines import Line, LineMap
+from nccs_pose.geometry.mirror import QuadricMirror
+from nccs_pose.geometry.pose import RigidTransform
+from nccs_pose.geometry.rig import Rig
+import numpy as np
+
+DISTORTION_MODELS = ('plumb_bob', 'rational_polynomial')
+
+_Value = TypeVar('_Value')
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig: sections `mirror`, `camera`, `mounting` (see config/room_rig.yaml).
+
+    Raises
+    ------
+    FileError
+        One sentence that names the file, the key, the value and what is accepted.
+
+    """
+    top = read_yaml(path)
+    mirror, camera, mounting = (top.section(key) for key in ('mirror', 'camera', 'mounting'))
+    top.done()
+    quadric = _mirror(mirror)
+    pinhole = _camera(camera)
+    cop = camera.numbers('cop', (3,), unit='m')
+    rotation = camera.rotation('R_mirror_camera')
+    camera.done()
+    transform = RigidTransform.from_rpy(
+        mounting.numbers('rpy', (3,), unit='rad'), mounting.numbers('translation', (3,), unit='m')
+    )
+    mounting.done()
+    return _build(top, 'camera', lambda: Rig(quadric, pinhole, cop, rotation, transform))
+
+
+def load_map(path: str | Path) -> LineMap:
+    """Read a map: `lines` with start and end, and their common width, colour and frame.
+
+    Raises
+    ------
+    FileError
+        One sentence that names the file, the key, the value and what is accepted.
+
+    """
+    top = read_yaml(path)
+    frame = top.text('frame', 'map')
+    width = top.number('width', 0.0, unit='m', above=0.0)
+    colour = top.text('colour', 'green')
+    sections = top.sections('lines')
+    top.done()
+    lines: list[Line] = []
+    for index, section in enumerate(sections):
+        line = _line(section, width, colour, default_name=f'line{index}')
+        if line.name in [other.name for other in lines]:
+            raise section.error('name', f'is given twice in the map: {line.name!r}')
+        lines.append(line)
+    if len(lines) < 2:
+        raise top.error('lines', f'must hold at least 2 lines, it holds {len(lines)}')
+    return _build(top, 'lines', lambda: LineMap(tuple(lines), frame=frame))
+
+
+def save_rig(rig: Rig, path: str | Path, comment: str = '') -> None:
+    """Write a rig as `load_rig` reads it, every number exactly; `comment` goes on top."""
+    mirror, camera, mounting = rig.mirror, rig.camera, rig.T_base_mirror
+    rim = f'  rim_radius: {_number(mirror.rim_radius)}  # m\n' if mirror.rim_radius else ''
+    write_text(
+        path,
+        f'{_comment(comment)}'
+        'mirror:  # x^2 + y^2 + A z^2 + B z - C = 0, symmetry axis z\n'
+        f'  A: {_number(mirror.A)}\n'
+        f'  B: {_number(mirror.B)}  # m\n'
+        f'  C: {_number(mirror.C)}  # m^2\n'
+        f'{rim}'
+        'camera:\n'
+        f'  width: {camera.width}  # px\n'
+        f'  height: {camera.height}  # px\n'
+        f'  K: {_rows(camera.K)}  # px, row by row\n'
+        f'  distortion_model: {camera.distortion_model}\n'
+        f'  distortion: {_list(camera.distortion)}\n'
+        f'  cop: {_list(rig.cop)}  # m, centre of projection in the mirror frame\n'
+        f'  R_mirror_camera: {_rows(rig.R_mirror_camera)}  # optical axes in the mirror frame\n'
+        'mounting:  # T_base_mirror\n'
+        f'  translation: {_list(mounting.translation)}  # m\n'
+        f'  rpy: {_list(mounting.rpy())}  # rad, R = Rz(yaw) Ry(pitch) Rx(roll)\n',
+    )
+
+
+def save_map(line_map: LineMap, path: str | Path, comment: str = '') -> None:
+    """Write a map as `load_map` reads it, every number exactly; `comment` goes on top."""
+    rows = [
+        f'  - {{name: {_quoted(line.name or f"line{index}")}, start: {_list(line.start)}, '
+        f'end: {_list(line.end)}, width: {_number(line.width)}, colour: {_quoted(line.colour)}}}\n'
+        for index, line in enumerate(line_map)
+    ]
+    write_text(
+        path,
+        f'{_comment(comment)}frame: {_quoted(line_map.frame)}\nlines:  # centre lines, metres\n'
+        f'{"".join(rows)}',
+    )
+
+
+def _mirror(section: Section) -> QuadricMirror:
+    A = section.number('A')
+    B = section.number('B', unit='m')
+    C = section.number('C', unit='m^2')
+    rim_radius = section.number('rim_radius', None, unit='m', above=0.0)
+    section.done()
+    return _build(section, '', lambda: QuadricMirror(A, B, C, rim_radius=rim_radius))
+
+
+def _camera(section: Section) -> PinholeCamera:
+    width = section.integer('width')
+    height = section.integer('height')
+    K = section.numbers('K', (9,), unit='px').reshape(3, 3)
+    if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
+        raise section.error('K', f'must have focal lengths above 0, not {K[0, 0]} and {K[1, 1]}')
+    if K[0, 1] != 0.0 or K[1, 0] != 0.0 or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
+        raise section.error('K', f'must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], not {K.ravel()}')
+    model = section.text('distortion_model', 'plumb_bob', choices=DISTORTION_MODELS)
+    lengths = (0, 4, 5) if model == 'plumb_bob' else (8,)
+    distortion = tuple(section.numbers('distortion', lengths, default=()))
+    return _build(
+        section, '', lambda: PinholeCamera.from_K(width, height, K, model, distortion)
+    )
+
+
+def _line(section: Section, width: float, colour: str, default_name: str) -> Line:
+    name = section.text('name', default_name)
+    ends = []
+    for key in ('start', 'end'):
+        point = section.numbers(key, (2, 3), unit='m')
+        ends.append(point if point.size == 3 else np.append(point, 0.0))
+    width = section.number('width', width, unit='m', above=0.0)
+    colour = section.text('colour', colour)
+    section.done()
+    if np.array_equal(*ends):
+        raise section.error('', f'(line {name!r}) has no length: start and end are {ends[0]}')
+    return _build(section, '', lambda: Line(*ends, width=width, colour=colour, name=name))
+
+
+def _build(section: Section, key: str, make: Callable[[], _Value]) -> _Value:
+    """Make a geometric value; what the geometry refuses is refused with the file and key."""
+    try:
+        return make()
+    except GeometryError as error:
+        raise section.error(key, f'is refused: {str(error).rstrip(".")}') from error
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _list(values: object) -> str:
+    return f'[{", ".join(_number(value) for value in np.ravel(np.asarray(values, dtype=float)))}]'
+
+
+def _rows(matrix: np.ndarray) -> str:
+    rows = [', '.join(_number(value) for value in row) for row in np.asarray(matrix, dtype=float)]
+    return '[' + ',\n    '.join(rows) + ']'
+
+
+def _quoted(text: str) -> str:
+    """Write a word so that YAML reads the same word back, whatever it holds."""
+    plain = text.isidentifier() and text.lower() not in {'null', 'true', 'false'}
+    return text if plain else "'" + text.replace("'", "''") + "'"
+
+
+def _comment(comment: str) -> str:
+    return ''.join(f'# {line}'.rstrip() + '\n' for line in comment.splitlines())
