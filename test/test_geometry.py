@@ -17,15 +17,25 @@
 from __future__ import annotations
 
 import cv2
-from hypothesis import given, strategies as st
-from nccs_pose.errors import GeometryError
-from nccs_pose.geometry import (
-    Line, LineMap, PinholeCamera, Pose2, QuadricMirror, Rig, RigidTransform, wrap_angle)
-from nccs_pose.geometry.pose import rotation_exp
-from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+from nccs_pose.errors import GeometryError
+from nccs_pose.geometry import (
+    Line,
+    LineMap,
+    PinholeCamera,
+    Pose2,
+    QuadricMirror,
+    Rig,
+    RigidTransform,
+    wrap_angle,
+)
+from nccs_pose.geometry.pose import rotation_exp
+from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
 
 finite = st.floats(-5.0, 5.0)
 angles = st.floats(-10.0, 10.0)
@@ -172,7 +182,8 @@ def test_distortion_agrees_with_opencv_and_inverts(model: str, distortion: list)
     for k in range(2):
         shift = np.zeros(2)
         shift[k] = step
-        numeric = (camera.directions(pixels + shift) - camera.directions(pixels - shift)) / (2 * step)
+        ahead, behind = camera.directions(pixels + shift), camera.directions(pixels - shift)
+        numeric = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(jacobian[:, :, k], numeric, atol=1e-9)
 
 
@@ -238,7 +249,7 @@ def test_floor_points_are_where_the_ray_meets_the_ground() -> None:
     rig = RIGS['spherical']
     rays = rig.back_project(some_pixels(rig))
     floor, reaches = rays.floor_points()
-    assert 20 < reaches.sum()
+    assert reaches.sum() > 20
     points = np.column_stack([floor, np.zeros(len(floor))])[reaches]
     np.testing.assert_allclose(
         np.cross(points, rays.direction[reaches]), rays.moment[reaches], atol=1e-9)
@@ -260,13 +271,13 @@ def test_rigs_that_cannot_be_are_refused_by_name() -> None:
     with pytest.raises(GeometryError, match='does not see the mirror'):
         Rig(good.mirror, good.camera, good.cop, np.eye(3), MOUNTING)
     with pytest.raises(GeometryError, match='x must be 0'):
-        Rig(good.mirror, good.camera, good.cop + [0.001, 0, 0], good.R_mirror_camera, MOUNTING)
+        Rig(good.mirror, good.camera, good.cop + np.array([0.001, 0, 0]), good.R_mirror_camera, MOUNTING)
     with pytest.raises(GeometryError, match='orthonormal'):
         Rig(good.mirror, good.camera, good.cop, 1.1 * good.R_mirror_camera, MOUNTING)
 
 
 def test_lines_that_are_none_are_refused_by_name() -> None:
-    with pytest.raises(GeometryError, match="'a'.*coincide"):
+    with pytest.raises(GeometryError, match=r"'a'.*coincide"):
         Line([1, 2, 0], [1, 2, 0], name='a')
     with pytest.raises(GeometryError, match='horizontal'):
         Line([0, 0, 0], [0, 0, 1], width=0.05)

@@ -19,10 +19,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from nccs_pose.errors import GeometryError
+from nccs_pose.geometry.pose import Array
 
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8}
 
@@ -75,7 +76,7 @@ class PinholeCamera:
         object.__setattr__(self, 'distortion', tuple(float(v) for v in self.distortion))
 
     @classmethod
-    def from_K(  # noqa: N802 (K is the matrix's name in CameraInfo)
+    def from_K(
         cls, width: int, height: int, K: ArrayLike, distortion_model: str = 'plumb_bob',
         distortion: ArrayLike = (),
     ) -> PinholeCamera:
@@ -92,7 +93,7 @@ class PinholeCamera:
                    distortion_model, coefficients)
 
     @property
-    def K(self) -> Array:  # noqa: N802 (K is the matrix's name in CameraInfo)
+    def K(self) -> Array:
         """The calibration matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
@@ -202,4 +203,5 @@ class PinholeCamera:
         adjugate = np.empty_like(jacobian)
         adjugate[:, 0, 0], adjugate[:, 1, 1] = jacobian[:, 1, 1], jacobian[:, 0, 0]
         adjugate[:, 0, 1], adjugate[:, 1, 0] = -jacobian[:, 0, 1], -jacobian[:, 1, 0]
-        return out - distorted, adjugate / np.where(regular, determinant, 1.0)[:, None, None], regular
+        inverse = adjugate / np.where(regular, determinant, 1.0)[:, None, None]
+        return out - distorted, inverse, regular

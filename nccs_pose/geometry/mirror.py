@@ -20,10 +20,11 @@ from dataclasses import dataclass
 from functools import cached_property
 import math
 
-from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
+
+from nccs_pose.errors import GeometryError
+from nccs_pose.geometry.pose import Array
 
 _CONE_TOLERANCE = 1e-12
 

@@ -1,0 +1,113 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the localiser says of one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.vision.line_points import LinePoints
+
+
+class State(Enum):
+    """How much the localiser knows; the definitions are numeric and stand in its options."""
+
+    SEARCHING = 'searching'
+    """No pose yet: nothing in the images so far fits the map."""
+    AMBIGUOUS = 'ambiguous'
+    """Several poses explain the image about equally well; all are candidates, none is given."""
+    TRACKING = 'tracking'
+    """The pose explains the image."""
+    COASTING = 'coasting'
+    """The image says too little; the pose is the last one carried on by odometry."""
+    LOST = 'lost'
+    """There was a pose, and it no longer explains the image nor can be carried on."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A pose that may be the right one, and the fraction of line-like pixels it explains."""
+
+    pose: Pose2
+    score: float
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Signals of health that a covariance cannot give.
+
+    :ivar lines_used: map lines that the pose rests on.
+    :ivar points_used: pixels that it rests on.
+    :ivar residual_px: root mean square residual, px.
+    :ivar expected_px: what the noise measured in the image makes of it, px.
+    :ivar explained: fraction of the predicted, visible line pixels that were found, 0 to 1.
+    :ivar claimed: fraction of the line-like pixels in the image that the pose explains, 0 to 1;
+        NaN where nothing was looked for.
+    :ivar ambiguity: score of the second best pose over that of the best, 0 to 1.
+    :ivar unobserved: directions that the lines in view do not fix, in words.
+    """
+
+    lines_used: int = 0
+    points_used: int = 0
+    residual_px: float = 0.0
+    expected_px: float = 0.0
+    explained: float = 0.0
+    claimed: float = float('nan')
+    ambiguity: float = 0.0
+    unobserved: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """Seconds spent on one frame, by stage."""
+
+    predict: float = 0.0
+    detect: float = 0.0
+    associate: float = 0.0
+    measure: float = 0.0
+    refine: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """All stages together, seconds."""
+        return self.predict + self.detect + self.associate + self.measure + self.refine
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The answer to one frame.
+
+    :ivar stamp_ns: the image's own stamp, nanoseconds.
+    :ivar state: how much is known.
+    :ivar reason: why, in words.
+    :ivar pose: T_map_base; None where there is no trustworthy one.
+    :ivar covariance: of (x, y, yaw) in the map, (3, 3); m^2, m rad, rad^2; None with the pose.
+    :ivar candidates: poses that may be right, best first.
+    :ivar points: the line pixels it rests on, labelled by the map's lines; None where none.
+    :ivar quality: health signals.
+    :ivar times: cost by stage.
+    """
+
+    stamp_ns: int
+    state: State
+    reason: str
+    pose: Pose2 | None = None
+    covariance: Array | None = None
+    candidates: tuple[Candidate, ...] = ()
+    points: LinePoints | None = None
+    quality: Quality = field(default_factory=Quality)
+    times: StageTimes = field(default_factory=StageTimes)
