@@ -18,11 +18,10 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
-
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.floor_view import FloorView
 from nccs_pose.simulation.scene import Obstacle, RobotBody
+import numpy as np
 
 # The light comes from here in the frame of the thing; what is turned away keeps the ambient part.
 _SUN = np.array([0.6, 0.8])

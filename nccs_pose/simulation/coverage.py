@@ -23,10 +23,9 @@ is left against 64 x 64 rays a pixel.
 
 from __future__ import annotations
 
-import numpy as np
-
 from nccs_pose.geometry.lines import Line
 from nccs_pose.simulation.floor_view import FloorView
+import numpy as np
 
 
 def half_plane_area(value: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:

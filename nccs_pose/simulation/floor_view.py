@@ -23,10 +23,9 @@ from __future__ import annotations
 from collections import OrderedDict
 import dataclasses
 
-import numpy as np
-
 from nccs_pose.errors import SimulationError
 from nccs_pose.geometry.rig import Rig
+import numpy as np
 
 # Floor farther away than this is drawn as the horizon, m.
 REACH = 30.0

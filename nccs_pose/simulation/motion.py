@@ -12,14 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How the robot moves: unicycle trajectories."""
+"""How the robot moves: planar trajectories of a robot that cannot move sideways."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Protocol
 
+from nccs_pose.errors import SimulationError
 from nccs_pose.geometry.pose import Pose2
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,3 +46,120 @@ def integrate_twist(pose: Pose2, twist: Twist, duration: float) -> Pose2:
     # The chord of the arc: distance * sin(half) / half, in the direction of half the angle.
     chord = distance * (math.sin(half) / half if abs(half) > 1e-8 else 1.0)
     return pose @ Pose2(chord * math.cos(half), chord * math.sin(half), angle)
+
+
+class Trajectory(Protocol):
+    """Where the robot is and how it moves, at any time t >= 0 in s."""
+
+    def pose(self, t: float) -> Pose2:
+        """Give the pose of base_link in the map."""
+
+    def twist(self, t: float) -> Twist:
+        """Give its velocity, consistent with the poses."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arc:
+    """Constant twist: a circle, a straight line, a turn on the spot, or rest."""
+
+    start: Pose2
+    velocity: Twist
+
+    def pose(self, t: float) -> Pose2:
+        return integrate_twist(self.start, self.velocity, t)
+
+    def twist(self, t: float) -> Twist:
+        return self.velocity
+
+
+class Loop:
+    """A closed smooth track through waypoints, driven again and again at one speed.
+
+    The track is a periodic cubic spline; the robot looks along it, so that it never slips
+    sideways, and its turn rate is speed times curvature.
+    """
+
+    def __init__(self, waypoints: ArrayLike, speed: float) -> None:
+        """Lay the track.
+
+        :param waypoints: (N, 2) in the map, m; N >= 3, none equal to the next.
+        :param speed: m/s.
+        :raises SimulationError: if the waypoints make no loop or the speed is not positive.
+        """
+        points = np.asarray(waypoints, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+            raise SimulationError(f'a loop needs (N, 2) waypoints, N >= 3, not {points.shape}')
+        if not (math.isfinite(speed) and speed > 0.0):
+            raise SimulationError(f'loop speed must be > 0 m/s, is {speed}')
+        closed = np.vstack([points, points[:1]])
+        chords = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+        if not chords.min() > 1e-6:
+            raise SimulationError(f'waypoint {int(chords.argmin())} of the loop equals the next')
+        self.speed = speed
+        # The square root of the chords as knots keeps the track from overshooting.
+        knots = np.r_[0.0, np.cumsum(np.sqrt(chords))]
+        self._track = CubicSpline(knots, closed, bc_type='periodic')
+        self._velocity, self._acceleration = self._track.derivative(1), self._track.derivative(2)
+        self._knots = np.linspace(0.0, knots[-1], 200 * len(points) + 1)
+        self._lengths = self._measure(self._knots)
+        self.length = float(self._lengths[-1])
+
+    @property
+    def period(self) -> float:
+        """Time for one round, s."""
+        return self.length / self.speed
+
+    def _measure(self, knots: np.ndarray) -> np.ndarray:
+        """Length of the track up to each knot, by Gauss-Legendre over each piece."""
+        nodes, weights = np.polynomial.legendre.leggauss(5)
+        half = 0.5 * np.diff(knots)
+        at = knots[:-1, None] + half[:, None] * (1.0 + nodes)
+        speed = np.linalg.norm(self._velocity(at), axis=-1)
+        return np.r_[0.0, np.cumsum(half * (speed @ weights))]
+
+    def _parameter(self, t: float) -> float:
+        """Spline parameter after t s: looked up, then one Newton step on the length."""
+        target = (self.speed * t) % self.length
+        i = int(np.searchsorted(self._lengths, target, side='right')) - 1
+        i = min(max(i, 0), len(self._knots) - 2)
+        left, right = self._knots[i], self._knots[i + 1]
+        share = (target - self._lengths[i]) / (self._lengths[i + 1] - self._lengths[i])
+        guess = left + share * (right - left)
+        travelled = self._lengths[i] + self._measure(np.array([left, guess]))[-1]
+        return float(guess + (target - travelled) / np.linalg.norm(self._velocity(guess)))
+
+    def pose(self, t: float) -> Pose2:
+        parameter = self._parameter(t)
+        (x, y), (vx, vy) = self._track(parameter), self._velocity(parameter)
+        return Pose2(float(x), float(y), math.atan2(vy, vx))
+
+    def twist(self, t: float) -> Twist:
+        parameter = self._parameter(t)
+        (vx, vy), (ax, ay) = self._velocity(parameter), self._acceleration(parameter)
+        return Twist(self.speed, self.speed * float(vx * ay - vy * ax) / math.hypot(vx, vy) ** 3)
+
+
+def figure_of_eight(
+    length: float = 2.2, width: float = 1.3, speed: float = 0.35, centre: ArrayLike = (0.0, 0.0)
+) -> Loop:
+    """Give a lying figure of eight about `centre`, m and m/s: turns both ways, crosses itself."""
+    phase = np.arange(16) * (2.0 * np.pi / 16)
+    points = np.stack([0.5 * length * np.sin(phase), 0.5 * width * np.sin(2.0 * phase)], axis=1)
+    return Loop(points + np.asarray(centre, dtype=float), speed)
+
+
+def random_loop(
+    rng: np.random.Generator, half_size: ArrayLike = (1.2, 0.8), speed: float = 0.35,
+    waypoints: int = 6,
+) -> Loop:
+    """Give a smooth loop of its own for every generator, about the map's origin.
+
+    :param half_size: of the region that the waypoints keep to along x and y, m.
+    """
+    step = 2.0 * np.pi / waypoints
+    angle = step * (np.arange(waypoints) + rng.uniform(-0.15, 0.15, waypoints))
+    angle += rng.uniform(0.0, 2.0 * np.pi)
+    radius = rng.uniform(0.65, 1.0, waypoints)
+    way = rng.choice([-1.0, 1.0])
+    ellipse = np.stack([np.cos(angle), way * np.sin(angle)], axis=1)
+    return Loop(radius[:, None] * ellipse * np.asarray(half_size, dtype=float), speed)

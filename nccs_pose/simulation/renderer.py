@@ -16,8 +16,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.bodies import body_overlay, paint_obstacle
 from nccs_pose.simulation.coverage import tape_coverage
@@ -31,6 +29,7 @@ from nccs_pose.simulation.textures import (
     floor_level,
     wall_colours,
 )
+import numpy as np
 
 
 def render(

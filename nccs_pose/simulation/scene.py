@@ -24,8 +24,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import numpy as np
-
 from nccs_pose.errors import SimulationError
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.lines import Line, LineMap
@@ -33,6 +31,7 @@ from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import RigidTransform
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.sensors import SensorModel
+import numpy as np
 
 Colour = tuple[float, float, float]
 

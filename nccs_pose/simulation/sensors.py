@@ -21,9 +21,8 @@ import functools
 import math
 
 import cv2
-import numpy as np
-
 from nccs_pose.errors import SimulationError
+import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)

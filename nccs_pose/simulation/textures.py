@@ -19,9 +19,8 @@ from __future__ import annotations
 import functools
 
 import cv2
-import numpy as np
-
 from nccs_pose.simulation.scene import FloorTexture, Room
+import numpy as np
 
 # The floor's pattern repeats after this many tiles, each this many texels wide.
 _TILES, _TEXELS = 4, 128
