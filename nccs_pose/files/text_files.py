@@ -27,11 +27,7 @@ def write_text(path: str | Path, text: str) -> None:
 
     A reader, or a run that is interrupted, never sees half of it. Missing folders are made.
 
-    Raises
-    ------
-    FileError
-        The file cannot be written; names it and the reason.
-
+    :raises FileError: the file cannot be written; names it and the reason.
     """
     path = Path(path)
     temporary = path.with_name(f'.{path.name}.{os.getpid()}.part')

@@ -41,11 +41,7 @@ _Value = TypeVar('_Value')
 def load_rig(path: str | Path) -> Rig:
     """Read a rig: sections `mirror`, `camera`, `mounting` (see config/room_rig.yaml).
 
-    Raises
-    ------
-    FileError
-        One sentence that names the file, the key, the value and what is accepted.
-
+    :raises FileError: one sentence that names the file, the key, the value and what is accepted.
     """
     top = read_yaml(path)
     mirror, camera, mounting = (top.section(key) for key in ('mirror', 'camera', 'mounting'))
@@ -65,11 +61,7 @@ def load_rig(path: str | Path) -> Rig:
 def load_map(path: str | Path) -> LineMap:
     """Read a map: `lines` with start and end, and their common width, colour and frame.
 
-    Raises
-    ------
-    FileError
-        One sentence that names the file, the key, the value and what is accepted.
-
+    :raises FileError: one sentence that names the file, the key, the value and what is accepted.
     """
     top = read_yaml(path)
     frame = top.text('frame', 'map')

@@ -77,11 +77,8 @@ _resolve(
 def read_yaml(path: str | Path) -> Section:
     """Read a YAML file whose top is a mapping.
 
-    Raises
-    ------
-    FileError
-        The file cannot be read, is no YAML, or its top is no mapping; names the file and line.
-
+    :raises FileError: the file cannot be read, is no YAML, or its top is no mapping; names the
+        file and line.
     """
     path = Path(path)
     try:

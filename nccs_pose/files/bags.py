@@ -1,0 +1,224 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Bags of ROS 2 (and 1) read without ROS, by rosbags.
+
+`BagReader` gives what the localiser needs, in the order in which it was recorded; `BagWriter`
+(bag_writer.py) writes the same topics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from nccs_pose.errors import FileError, GeometryError
+from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry, StampedTruth
+from nccs_pose.files.bag_topics import (
+    BagTopics,
+    find_topics,
+    list_topics,
+    POSE,
+    TYPES,
+)
+from nccs_pose.files.bag_writer import BagWriter
+from nccs_pose.files.rosbags_import import AnyReader, jazzy_typestore
+from nccs_pose.files.trajectories import quaternion_yaw
+from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.geometry.pose import Pose2
+import numpy as np
+
+__all__ = [
+    'BagReader', 'BagTopics', 'BagWriter', 'StampedImage', 'StampedOdometry', 'StampedTruth']
+
+
+class BagReader:
+    """A bag, open for reading; use it as a context manager.
+
+    :param path: a rosbag2 folder (or a single .mcap, .db3 or ROS 1 .bag file).
+    :param topics: names of topics; those not given are found by type and name.
+    :raises FileError: if there is no bag, or it is cut short, or a topic is missing or ambiguous.
+    """
+
+    def __init__(self, path: str | Path, topics: BagTopics | None = None) -> None:
+        self.path = Path(path)
+        self._wanted = topics or BagTopics()
+        self._stack = ExitStack()
+        self._reader: Any = None
+        self.topics = self._wanted
+
+    def __enter__(self) -> BagReader:
+        if not self.path.exists():
+            raise FileError(f'{self.path}: no such bag.')
+        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
+            raise FileError(
+                f'{self.path}: is no bag, or its recording was cut off: it has no metadata.yaml '
+                '(`ros2 bag reindex` makes one).')
+        with self._words():
+            reader = AnyReader([self.path], default_typestore=jazzy_typestore())
+            self._reader = self._stack.enter_context(reader)
+        try:
+            self.topics = find_topics(self._wanted, self.topic_types(), str(self.path))
+        except FileError:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def topic_types(self) -> dict[str, str]:
+        """Message type by topic, of the topics that have messages."""
+        return {
+            connection.topic: connection.msgtype
+            for connection in self._reader.connections if connection.msgcount}
+
+    def image_count(self) -> int:
+        """How many images the bag holds."""
+        return self._count(self._image_topic())
+
+    def camera(self) -> PinholeCamera | None:
+        """The camera of the first CameraInfo; None if there is none, or it is not calibrated."""
+        for _, message in self._messages(self.topics.camera_info):
+            if not np.any(message.k):
+                return None
+            try:
+                return PinholeCamera.from_K(
+                    int(message.width), int(message.height), np.reshape(message.k, (3, 3)),
+                    message.distortion_model or 'plumb_bob', message.d)
+            except GeometryError as error:
+                raise FileError(
+                    f'{self.path}: {self.topics.camera_info}: {error}') from error
+        return None
+
+    def events(self, odometry: bool = True, ground_truth: bool = False) -> Iterator[BagEvent]:
+        """Images, and odometry and ground truth if wanted and there, by time of reception.
+
+        :raises FileError: if the bag has no image, or a message cannot be read.
+        """
+        names = [self._image_topic()]
+        names += [self.topics.odom] if odometry and self.topics.odom else []
+        truth = self.topics.ground_truth if ground_truth else None
+        names += [truth] if truth and truth not in names else []
+        for topic, kind, received, message in self._raw(names):
+            if kind in TYPES['image']:
+                yield StampedImage(
+                    _stamp(message), received, message.header.frame_id, topic, message)
+                continue
+            if topic == self.topics.odom and odometry:
+                yield StampedOdometry(
+                    _stamp(message), received, message.header.frame_id, message.child_frame_id,
+                    self._pose(topic, kind, message))
+            if topic == truth:
+                yield StampedTruth(
+                    _stamp(message), received, message.header.frame_id,
+                    self._pose(topic, kind, message))
+
+    def ground_truth(self) -> Trajectory:
+        """All ground-truth poses by rising stamp.
+
+        :raises FileError: if the bag has none, or one of them is no pose.
+        """
+        topic = self.topics.ground_truth
+        if topic is None:
+            raise FileError(
+                f'{self.path}: has no ground-truth topic (a pose or odometry whose name says '
+                f'so); it has {list_topics(self.topic_types())}.')
+        return self._trajectory(topic)
+
+    def odometry(self) -> Trajectory:
+        """All odometry poses by rising stamp, in odometry's own frame; empty if there is none."""
+        if self.topics.odom is None:
+            return Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+        return self._trajectory(self.topics.odom)
+
+    def serialised(self) -> Iterator[tuple[str, str, int, bytes]]:
+        """Topic, type, time of reception (ns) and CDR bytes of every message, by time."""
+        with self._words():
+            for connection, received, data in self._reader.messages():
+                yield connection.topic, connection.msgtype, received, data
+
+    def _trajectory(self, topic: str) -> Trajectory:
+        rows = [
+            (_stamp(message), self._pose(topic, kind, message))
+            for _, kind, _, message in self._raw([topic])]
+        return Trajectory(
+            np.array([stamp for stamp, _ in rows], dtype=np.int64),
+            np.array([pose.as_array() for _, pose in rows])).in_order()
+
+    def _image_topic(self) -> str:
+        if self.topics.image is None:
+            raise FileError(
+                f'{self.path}: has no images; it has {list_topics(self.topic_types())}.')
+        return self.topics.image
+
+    def _count(self, topic: str) -> int:
+        return sum(c.msgcount for c in self._reader.connections if c.topic == topic)
+
+    def _messages(self, topic: str | None) -> Iterator[tuple[int, Any]]:
+        if topic is not None:
+            for _, _, received, message in self._raw([topic]):
+                yield received, message
+
+    def _raw(self, topics: list[str]) -> Iterator[tuple[str, str, int, Any]]:
+        """Topic, type, time of reception and message, by time."""
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        iterator = self._reader.messages(connections=connections)
+        while True:
+            with self._words():
+                item = next(iterator, None)
+                if item is None:
+                    return
+                connection, received, data = item
+            with self._words(f'message on {connection.topic} at {received} ns'):
+                message = self._reader.deserialize(data, connection.msgtype)
+            yield connection.topic, connection.msgtype, received, message
+
+    def _pose(self, topic: str, kind: str, message: Any) -> Pose2:
+        pose = message.pose if kind == POSE else message.pose.pose
+        q, p = pose.orientation, pose.position
+        norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
+        try:
+            if not 0.98 < norm < 1.02:
+                raise GeometryError(f'quaternion ({q.x}, {q.y}, {q.z}, {q.w}) is no rotation')
+            return Pose2(p.x, p.y, quaternion_yaw(q.x, q.y, q.z, q.w))
+        except GeometryError as error:
+            raise FileError(f'{self.path}: {topic} at {_stamp(message)} ns: {error}.') from error
+
+    @contextmanager
+    def _words(self, what: str = '') -> Iterator[None]:
+        """Say in one sentence what rosbags trips over.
+
+        On a damaged file it raises whatever its parser met: its own errors, but also struct.error,
+        AssertionError, TypeError, UnicodeDecodeError, MemoryError; none may reach the user.
+        """
+        try:
+            yield
+        except (FileError, GeneratorExit):
+            raise
+        except Exception as error:
+            reason = ' '.join(str(error).split()) or type(error).__name__
+            raise FileError(
+                f'{self.path}: {what or "the bag"} cannot be read, it may be cut short or '
+                f'damaged: {reason.rstrip(".")}.') from error
+
+
+def _stamp(message: Any) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
