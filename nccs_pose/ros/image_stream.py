@@ -1,0 +1,125 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The image subscription: decoding, missing frames, silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+from nccs_pose.errors import FrameRefusedError, NccsPoseError
+from nccs_pose.ros.conversions import decode, stamp_to_ns
+from nccs_pose.ros.diagnostics import Tally
+from nccs_pose.ros.interface import IMAGE, IMAGE_COMPRESSED
+from nccs_pose.ros.qos import overridable, profile
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import qos_policy_name_from_kind
+from sensor_msgs.msg import CompressedImage, Image
+
+OnFrame = Callable[[int, str, 'NDArray[np.uint8]'], None]
+
+
+class ImageStream:
+    """Subscribes images and hands on each that can be decoded.
+
+    Missing images are counted by the publisher's sequence numbers; what of them the middleware
+    reports as lost was lost on the way, the rest was let go because the node was busy.
+
+    :ivar topic: full name of the topic.
+    :ivar decode_s: seconds for decoding the last image.
+    :ivar arrived: monotonic time of the last image, seconds.
+    """
+
+    def __init__(self, node: Node, transport: str, tally: Tally, on_frame: OnFrame) -> None:
+        endpoint, kind = (
+            (IMAGE, Image) if transport == 'raw' else (IMAGE_COMPRESSED, CompressedImage))
+        self._node = node
+        self._tally = tally
+        self._on_frame = on_frame
+        self._sequence: int | None = None
+        self._incompatible = ''
+        self._several = False
+        self._last_words = ''
+        self.decode_s = 0.0
+        self.arrived = time.monotonic()
+        self._subscription = node.create_subscription(
+            kind, endpoint.name, self._receive, profile(endpoint),
+            event_callbacks=SubscriptionEventCallbacks(
+                message_lost=self._lost, incompatible_qos=self._mismatched),
+            qos_overriding_options=overridable())
+        self.topic = self._subscription.topic_name
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+    def problem(self, patience: float) -> str:
+        """Why no image has come for `patience` seconds; empty if one has."""
+        publishers = self._node.count_publishers(self.topic)
+        self._several = publishers > 1
+        silence = time.monotonic() - self.arrived
+        if silence < patience:
+            words = ''
+        elif self._incompatible:
+            words = self._incompatible
+        elif not publishers:
+            words = f'nothing publishes {self.topic}'
+        else:
+            words = f'{self.topic} has a publisher, but no image came for a while'
+        if words and words != self._last_words:
+            self._node.get_logger().warning(words)
+        self._last_words = words
+        return words
+
+    def _receive(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
+        self.arrived = time.monotonic()
+        self._tally.received += 1
+        self._count_missing(info.get('publication_sequence_number'))
+        stamp_ns = stamp_to_ns(message.header.stamp)
+        try:
+            image = decode(message)
+            self.decode_s = time.monotonic() - self.arrived
+            self._on_frame(stamp_ns, message.header.frame_id, image)
+        except FrameRefusedError as error:
+            self._refuse(error.cause, error)
+        except NccsPoseError as error:
+            self._refuse('image_data', error)
+
+    def _refuse(self, cause: str, error: Exception) -> None:
+        self._tally.refuse(cause, str(error))
+        self._node.get_logger().warning(
+            f'image refused ({cause}): {error}', throttle_duration_sec=5.0)
+
+    def _count_missing(self, sequence: int | None) -> None:
+        before, self._sequence = self._sequence, sequence
+        # Two publishers count apart; a restarted one starts over.
+        if before is not None and sequence is not None and not self._several:
+            self._tally.missing += max(0, sequence - before - 1)
+
+    def _lost(self, event: Any) -> None:
+        # What was sent before the first image arrived was never ours to lose.
+        if self._sequence is not None:
+            self._tally.lost += int(event.total_count_change)
+
+    def _mismatched(self, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        self._incompatible = (
+            f'a publisher of {self.topic} offers another {policy} than is asked for: set '
+            f'qos_overrides.{self.topic}.subscription.{policy.lower()}')
+        self._node.get_logger().warning(self._incompatible)

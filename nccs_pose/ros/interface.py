@@ -1,0 +1,79 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node's names: every topic and service, with its type, quality of service and meaning.
+
+The node creates its endpoints from these values and the reference page prints them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A topic or service, by its relative name.
+
+    :ivar type: ROS type, e.g. ``sensor_msgs/msg/Image``.
+    :ivar reliable: reliable (True) or best effort (False) by default; topics only.
+    :ivar depth: messages kept (KEEP_LAST).
+    :ivar doc: one sentence.
+    """
+
+    name: str
+    type: str
+    doc: str
+    reliable: bool = True
+    depth: int = 10
+
+
+# An image that waits is an image that is late: only the newest is kept.
+IMAGE = Endpoint(
+    'image', 'sensor_msgs/msg/Image', 'Images, when image_transport is raw.', False, 1)
+IMAGE_COMPRESSED = Endpoint(
+    'image/compressed', 'sensor_msgs/msg/CompressedImage',
+    'JPEG or PNG images, when image_transport is compressed.', False, 1)
+CAMERA_INFO = Endpoint(
+    'camera_info', 'sensor_msgs/msg/CameraInfo',
+    'Only compared with the rig: a contradiction is an error that says both numbers.', False, 1)
+ODOM = Endpoint(
+    'odom', 'nav_msgs/msg/Odometry',
+    'Wheel odometry (optional): predicts the pose between images.', False, 100)
+INITIAL_POSE = Endpoint(
+    'initialpose', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    "RViz's 2D Pose Estimate, in the map frame; a covariance of zeros takes initial_pose_sigma.",
+    True, 5)
+INPUTS = (IMAGE, IMAGE_COMPRESSED, CAMERA_INFO, ODOM, INITIAL_POSE)
+
+POSE = Endpoint(
+    'pose', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    "base_link in the map frame at the image's stamp, only when it can be trusted.")
+DIAGNOSTICS = Endpoint(
+    '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
+    'State, reason, quality, counts and times; every second and whenever the state changes.')
+DEBUG_IMAGE = Endpoint(
+    '~/debug_image', 'sensor_msgs/msg/Image',
+    'What was detected and what was predicted; drawn only while somebody subscribes.', True, 1)
+MARKERS = Endpoint(
+    '~/markers', 'visualization_msgs/msg/MarkerArray',
+    'Map lines, observed points and pose ellipse for RViz; only while somebody subscribes.',
+    True, 1)
+OUTPUTS = (POSE, DIAGNOSTICS, DEBUG_IMAGE, MARKERS)
+
+RELOCALISE = Endpoint(
+    '~/relocalise', 'std_srvs/srv/Trigger', 'Forget the pose and search everywhere.')
+SET_PAUSED = Endpoint(
+    '~/set_paused', 'std_srvs/srv/SetBool', 'Stop (true) or resume (false) using images.')
+SERVICES = (RELOCALISE, SET_PAUSED)

@@ -1,0 +1,349 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node `localiser`: images in, pose with covariance out; a managed node.
+
+Everything is decided elsewhere: the core estimates, the modules beside this one convert; here the
+parts are wired to the lifecycle.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nccs_pose.errors import FrameRefusedError, NccsPoseError
+from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.yaml_files import load_map, load_rig
+from nccs_pose.ros import diagnostics
+from nccs_pose.ros.camera_check import contradiction
+from nccs_pose.ros.conversions import read_initial_pose, read_odometry
+from nccs_pose.ros.image_stream import ImageStream
+from nccs_pose.ros.interface import (
+    CAMERA_INFO, DIAGNOSTICS, Endpoint, INITIAL_POSE, ODOM, RELOCALISE, SET_PAUSED)
+from nccs_pose.ros.lifecycle import answer_every_request, in_words
+from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.ros.outputs import Outputs
+from nccs_pose.ros.parameters import NodeParameters
+from nccs_pose.ros.pose_keeper import PoseKeeper
+from nccs_pose.ros.qos import overridable, profile
+from nccs_pose.ros.resources import resolve
+from nccs_pose.ros.spinning import run
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo
+from std_srvs.srv import SetBool, Trigger
+
+DIAGNOSTICS_PERIOD = 1.0
+TRANSFORM_RETRY_PERIOD = 0.02
+
+
+class LocaliserNode(LifecycleNode):
+    """Wires topics, services and parameters to a Localiser."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__('localiser', **node_arguments)
+        answer_every_request(self)
+        self._tally = diagnostics.Tally()
+        self._localiser: Localiser | None = None
+        self._outputs: Outputs | None = None
+        self._stream: ImageStream | None = None
+        self._keeper: PoseKeeper | None = None
+        self._subscriptions_of_active: list[Subscription] = []
+        self._estimate: Estimate | None = None
+        self._pose_stamp_ns: int | None = None
+        self._latency_s = 0.0
+        self._paused = False
+        self._camera_problem = ''
+        self._configuration_problem = ''
+        self._shown: tuple[Any, ...] = ()
+        self._reported = (0, 0)
+        self._options = NodeOptions()
+        self._parameters = NodeParameters(self, self._on_live_change)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS))
+        self.create_service(Trigger, RELOCALISE.name, self._on_relocalise)
+        self.create_service(SetBool, SET_PAUSED.name, self._on_set_paused)
+        # Steady time: reports come also before the first /clock and while a bag is paused.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(DIAGNOSTICS_PERIOD, self._on_second, clock=self._steady)
+        self._retry_timer = self.create_timer(
+            TRANSFORM_RETRY_PERIOD, self._on_retry, clock=self._steady, autostart=False)
+
+    # Lifecycle
+
+    def autostart(self) -> None:
+        """Configure and activate, if the parameter says so."""
+        if self.get_parameter('autostart').value:
+            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load and check rig, map and parameters."""
+        return self._attempt('configuration', self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start to listen."""
+        return self._attempt('activation', self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop listening; the last good pose is saved."""
+        return self._attempt('deactivation', self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget rig, map and pose."""
+        return self._attempt('cleaning up', self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and forget everything."""
+        self._attempt('shutdown', self._deactivate)
+        return self._attempt('shutdown', self._clean_up)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Return to unconfigured, from where it can be tried again."""
+        self._deactivate()
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, what: str, step: Any) -> TransitionCallbackReturn:
+        try:
+            step()
+        except Exception as error:
+            words = str(error) if isinstance(error, NccsPoseError) else in_words(error)
+            self._configuration_problem = f'{what} failed: {words}'
+            self.get_logger().error(self._configuration_problem)
+            self._clean_up_after(what)
+            return TransitionCallbackReturn.FAILURE
+        self._configuration_problem = ''
+        self.get_logger().info(f'{what} done')
+        return TransitionCallbackReturn.SUCCESS
+
+    def _clean_up_after(self, what: str) -> None:
+        """Leave nothing half made behind a transition that failed."""
+        if what == 'activation':
+            self._deactivate()
+        elif what == 'configuration':
+            self._clean_up()
+
+    def _configure(self) -> None:
+        self._options, estimator = self._parameters.options()
+        for name in ('rig_file', 'map_file'):
+            if not getattr(self._options, name):
+                raise FrameRefusedError('configuration', f'parameter {name} is not set')
+        rig = load_rig(resolve(self._options.rig_file))
+        line_map = load_map(resolve(self._options.map_file))
+        self._localiser = Localiser(rig, line_map, estimator)
+        self._outputs = Outputs(self, self._options, rig, line_map, self._tally.refuse)
+        self._keeper = PoseKeeper(self._options, line_map, self.get_logger())
+
+    def _activate(self) -> None:
+        assert self._localiser is not None and self._keeper is not None
+        self._localiser.reset()
+        self._camera_problem = ''
+        self._estimate = None
+        self._pose_stamp_ns = None
+        self._keeper.offer(self._localiser)
+        self._stream = ImageStream(
+            self, self._options.image_transport, self._tally, self._on_frame)
+        self._subscriptions_of_active = [
+            self._listen(CameraInfo, CAMERA_INFO, self._on_camera_info),
+            self._listen(Odometry, ODOM, self._on_odometry),
+            self._listen(PoseWithCovarianceStamped, INITIAL_POSE, self._on_initial_pose),
+        ]
+        if self._options.tf_mode == 'map_to_odom':
+            self._retry_timer.reset()
+
+    def _listen(self, kind: type, endpoint: Endpoint, callback: Any) -> Subscription:
+        return self.create_subscription(
+            kind, endpoint.name, callback, profile(endpoint),
+            qos_overriding_options=overridable())
+
+    def _deactivate(self) -> None:
+        self._retry_timer.cancel()
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+        for subscription in self._subscriptions_of_active:
+            self.destroy_subscription(subscription)
+        self._subscriptions_of_active = []
+        if self._keeper is not None:
+            self._keeper.save()
+
+    def _clean_up(self) -> None:
+        if self._outputs is not None:
+            self._outputs.close()
+        self._outputs = self._localiser = self._keeper = self._estimate = None
+
+    # Input
+
+    def _on_frame(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> None:
+        assert self._localiser is not None and self._outputs is not None
+        assert self._stream is not None and self._keeper is not None
+        if self._paused:
+            return
+        estimate = self._localiser.process(stamp_ns, image)
+        self._estimate = estimate
+        if self._outputs.publish(estimate, frame_id, image, not self._withheld()):
+            self._tally.answered += 1
+            self._pose_stamp_ns = stamp_ns
+            self._keeper.remember(estimate)
+        self._latency_s = time.monotonic() - self._stream.arrived
+        if self._shown != self._summary():
+            self._report_diagnostics()
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        assert self._localiser is not None
+        if self._options.camera_info_check == 'off':
+            self._camera_problem = ''
+            return
+        words = contradiction(
+            message, self._localiser.rig.camera, self._options.camera_info_tolerance)
+        if words:
+            self._refuse('camera_info', words)
+        if words != self._camera_problem:
+            self._camera_problem = words
+            self._report_diagnostics()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        assert self._localiser is not None
+        try:
+            stamp_ns, pose = read_odometry(message, self._options.odom, self._options.base)
+            self._localiser.add_odometry(stamp_ns, pose)
+        except FrameRefusedError as error:
+            self._refuse(error.cause, str(error))
+        except NccsPoseError as error:
+            self._refuse('odom_data', str(error))
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        assert self._localiser is not None and self._keeper is not None
+        try:
+            pose, covariance = read_initial_pose(message, self._options.map_frame)
+            self._keeper.give(self._localiser, pose, covariance)
+        except FrameRefusedError as error:
+            self._refuse(error.cause, str(error))
+        except NccsPoseError as error:
+            self._refuse('initialpose_data', str(error))
+
+    def _on_relocalise(
+        self, request: Trigger.Request, response: Trigger.Response,
+    ) -> Trigger.Response:
+        if self._localiser is None:
+            response.success, response.message = False, 'the node is not configured'
+            return response
+        self._localiser.relocalise()
+        response.success, response.message = True, 'searching everywhere from the next image on'
+        return response
+
+    def _on_set_paused(
+        self, request: SetBool.Request, response: SetBool.Response,
+    ) -> SetBool.Response:
+        self._paused = bool(request.data)
+        response.success, response.message = True, 'paused' if self._paused else 'running'
+        self._report_diagnostics()
+        return response
+
+    def _on_live_change(self, options: NodeOptions, estimator: LocaliserOptions) -> None:
+        self._options = options
+        if self._localiser is not None:
+            self._localiser.update_options(estimator)
+
+    def _refuse(self, cause: str, words: str) -> None:
+        self._tally.refuse(cause, words)
+        self.get_logger().warning(f'refused ({cause}): {words}', throttle_duration_sec=5.0)
+
+    # Reports
+
+    def report(self, name: str, error: BaseException) -> None:
+        """Take note of an exception that a callback let out; the node lives on."""
+        self._tally.fail(name, error)
+        self.get_logger().error(
+            f'error in {name}: {in_words(error)}', throttle_duration_sec=5.0)
+
+    def close(self) -> None:
+        """Save the pose and stop, whatever state the node is in."""
+        self._deactivate()
+
+    def _withheld(self) -> str:
+        """Why no pose may leave, whatever the estimator says; empty if it may."""
+        if self._camera_problem and self._options.camera_info_check == 'refuse':
+            return self._camera_problem
+        return ''
+
+    def _problem(self) -> str:
+        if self._configuration_problem:
+            return self._configuration_problem
+        return 'paused' if self._paused else self._withheld()
+
+    def _summary(self) -> tuple[Any, ...]:
+        """What a change of makes a report due at once."""
+        return self._estimate.state if self._estimate else None, self._problem()
+
+    def _on_retry(self) -> None:
+        if self._outputs is not None:
+            self._outputs.transforms.retry(self.get_clock().now().nanoseconds)
+
+    def _on_second(self) -> None:
+        if self._keeper is not None:
+            self._keeper.save_if_due()
+        self._report_diagnostics()
+
+    def _report_diagnostics(self) -> None:
+        try:
+            label = self._state_machine.current_state[1]
+        except InvalidHandle:
+            return
+        now = self.get_clock().now()
+        age = (math.nan if self._pose_stamp_ns is None
+               else 1e-9 * (now.nanoseconds - self._pose_stamp_ns))
+        name, tally = self.get_name(), self._tally
+        statuses = [diagnostics.pose_status(name, label, self._problem(), self._estimate, age)]
+        if self._stream is not None:
+            troubles = sum(tally.refused.values()) + sum(tally.errors.values())
+            statuses += [
+                diagnostics.image_status(
+                    name, self._stream.topic, tally,
+                    self._stream.problem(self._options.silence_warning),
+                    troubles - self._reported[0], tally.lost - self._reported[1]),
+                diagnostics.time_status(
+                    name, self._estimate, self._stream.decode_s, self._latency_s)]
+            self._reported = (troubles, tally.lost)
+        self._shown = self._summary()
+        self._diagnostics.publish(diagnostics.diagnostic_array(now.to_msg(), statuses))
+
+
+def make_node() -> LocaliserNode:
+    """Create the node and start it, if it is to start by itself."""
+    node = LocaliserNode()
+    node.autostart()
+    return node
+
+
+def main() -> int:
+    """Entry point of `ros2 run nccs_pose localiser`."""
+    return run(make_node)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,86 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What leaves the node for one estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.evaluation.overlay import draw_overlay
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.rig import Rig
+from nccs_pose.ros.conversions import image_message, pose_message
+from nccs_pose.ros.interface import DEBUG_IMAGE, MARKERS, POSE
+from nccs_pose.ros.markers import marker_array
+from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.ros.qos import overridable, profile
+from nccs_pose.ros.transforms import TransformOutput
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from visualization_msgs.msg import MarkerArray
+
+
+class Outputs:
+    """Publishers of pose, transform, debug image and markers.
+
+    :raises OptionError: if a transform is asked for and cannot be made.
+    """
+
+    def __init__(
+        self, node: Node, options: NodeOptions, rig: Rig, line_map: LineMap,
+        refuse: Callable[[str, str], None],
+    ) -> None:
+        """Create them; `refuse` hears of transforms that could not be made."""
+        self._node = node
+        self._frame = options.map_frame
+        self._rig = rig
+        self._map = line_map
+        self.transforms = TransformOutput(node, options, refuse)
+        self._pose = node.create_publisher(
+            PoseWithCovarianceStamped, POSE.name, profile(POSE),
+            qos_overriding_options=overridable())
+        self._debug = node.create_publisher(Image, DEBUG_IMAGE.name, profile(DEBUG_IMAGE))
+        self._markers = node.create_publisher(MarkerArray, MARKERS.name, profile(MARKERS))
+
+    def publish(
+        self, estimate: Estimate, frame_id: str, image: NDArray[np.uint8], trusted: bool,
+    ) -> bool:
+        """Publish an estimate; what nobody subscribes is not computed.
+
+        :param frame_id: of the image.
+        :param trusted: false withholds pose and transform.
+        :returns: whether a pose was published.
+        """
+        given = trusted and estimate.pose is not None and estimate.covariance is not None
+        if given:
+            self._pose.publish(pose_message(
+                estimate.stamp_ns, self._frame, estimate.pose, estimate.covariance))
+            self.transforms.broadcast(estimate.stamp_ns, estimate.pose)
+        if self._debug.get_subscription_count():
+            drawn = draw_overlay(image, self._rig, self._map, estimate)
+            self._debug.publish(image_message(estimate.stamp_ns, frame_id, drawn))
+        if self._markers.get_subscription_count():
+            self._markers.publish(marker_array(self._frame, estimate, self._rig, self._map))
+        return given
+
+    def close(self) -> None:
+        """Destroy the publishers."""
+        self.transforms.close()
+        for publisher in (self._pose, self._debug, self._markers):
+            self._node.destroy_publisher(publisher)

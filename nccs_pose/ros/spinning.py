@@ -1,0 +1,116 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""An executor loop that no message and no callback can end.
+
+rclpy lets an exception of any callback out of `spin`, which ends the node, and a message that
+cannot be taken leaves its callback group locked for ever. Here both are reported and the loop
+goes on; SIGINT and SIGTERM end it in order, with exit code 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import traceback
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+Report = Callable[[str, BaseException], None]
+
+
+class GuardedExecutor(SingleThreadedExecutor):
+    """A single-threaded executor that reports what a message or callback raised."""
+
+    def __init__(self, report: Report) -> None:
+        super().__init__()
+        self._report = report
+
+    def _guarded(self, take: Callable[[Any], Any], entity: Any) -> Any:
+        try:
+            return take(entity)
+        except Exception as error:
+            self._report('taking a message', error)
+            return None
+
+    # Raised here, an exception would leave the entity's callback group busy for good.
+    def _take_subscription(self, sub: Any) -> Any:
+        return self._guarded(super()._take_subscription, sub)
+
+    def _take_client(self, client: Any) -> Any:
+        return self._guarded(super()._take_client, client)
+
+    def _take_service(self, srv: Any) -> Any:
+        return self._guarded(super()._take_service, srv)
+
+    def _take_waitable(self, waitable: Any) -> Any:
+        return self._guarded(super()._take_waitable, waitable)
+
+    def spin(self) -> None:
+        """Run callbacks until the context is shut down."""
+        while rclpy.ok():
+            try:
+                self.spin_once()
+            except (KeyboardInterrupt, ExternalShutdownException):
+                raise
+            except Exception as error:
+                if not rclpy.ok():  # shut down in the middle of a wait
+                    return
+                self._report(_culprit(error), error)
+
+
+def _culprit(error: BaseException) -> str:
+    """Name of the project's function in which the exception was raised, or of the last one."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if 'nccs_pose' in Path(frame.filename).parts]
+    frame = (ours or list(frames))[-1]
+    return f'{Path(frame.filename).stem}.{frame.name}'
+
+
+def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
+    """Initialise ROS, spin one node until it is told to stop, and clean up.
+
+    The node may have `report(name, exception)`, called for what its callbacks raise, and
+    `close()`, called before it is destroyed.
+
+    :returns: exit code: 0 after SIGINT, SIGTERM or an orderly shutdown.
+    """
+    node: Node | None = None
+    try:
+        rclpy.init(args=args)
+        node = make_node()
+        executor = GuardedExecutor(getattr(node, 'report', None) or _log(node))
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        try:
+            if node is not None:
+                getattr(node, 'close', lambda: None)()
+                node.destroy_node()
+        except KeyboardInterrupt:  # a second Ctrl-C while cleaning up
+            pass
+        rclpy.try_shutdown()
+    return 0
+
+
+def _log(node: Node) -> Report:
+    def report(name: str, error: BaseException) -> None:
+        node.get_logger().error(f'{name}: {type(error).__name__}: {error}')
+
+    return report

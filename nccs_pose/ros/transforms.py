@@ -1,0 +1,134 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The transform that the node broadcasts, by REP 105.
+
+Contract: with `map_to_odom` somebody else broadcasts odom -> base_link; it is looked up at the
+image's stamp and map -> odom is broadcast, so that map -> base_link is the estimate there. With
+`map_to_base` nobody does, and map -> base_link is broadcast itself. While a needed transform is
+missing nothing is broadcast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+from nccs_pose.errors import FrameRefusedError, OptionError
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.ros.conversions import (
+    ns_to_stamp, planar_to_pose, pose_to_planar, yaw_quaternion)
+from nccs_pose.ros.node_options import NodeOptions
+from rclpy.node import Node
+from rclpy.time import Time
+
+PATIENCE_NS = 1_000_000_000
+"""How long an estimate waits for the odometry transform at its stamp."""
+
+
+class TransformOutput:
+    """Broadcasts what `tf_mode` says.
+
+    :raises OptionError: if transforms are asked for and tf2_ros is not installed.
+    """
+
+    def __init__(self, node: Node, options: NodeOptions, refuse: Callable[[str, str], None]) -> None:
+        """Create the broadcaster, and the listener where one is needed.
+
+        :param refuse: called with cause and words when a transform could not be made.
+        """
+        self._options = options
+        self._refuse = refuse
+        self._pending: tuple[int, Pose2] | None = None
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._broadcaster: Any = None
+        if options.tf_mode == 'none':
+            return
+        try:
+            import tf2_ros
+        except ImportError as error:
+            raise OptionError(
+                f'tf_mode = {options.tf_mode} needs tf2_ros, which is not installed '
+                '(Ubuntu: apt install ros-jazzy-tf2-ros-py); tf_mode = none works without'
+            ) from error
+        self._broadcaster = tf2_ros.TransformBroadcaster(node)
+        if options.tf_mode == 'map_to_odom':
+            self._buffer = tf2_ros.Buffer(node=node)
+            self._listener = tf2_ros.TransformListener(self._buffer, node)
+            self._not_yet = tf2_ros.TransformException
+
+    @property
+    def waits(self) -> bool:
+        """Whether an estimate still waits for its odometry transform."""
+        return self._pending is not None
+
+    def broadcast(self, stamp_ns: int, pose: Pose2) -> None:
+        """Broadcast the transform of a new estimate T_map_base, now or when it can be made."""
+        if self._options.tf_mode == 'map_to_base':
+            self._send(stamp_ns, self._options.base, pose)
+        elif self._options.tf_mode == 'map_to_odom':
+            self._pending = (stamp_ns, pose)
+            self.retry(stamp_ns)
+
+    def retry(self, now_ns: int) -> None:
+        """Try again what waits; give it up once it is older than the patience."""
+        if self._pending is None:
+            return
+        stamp_ns, pose = self._pending
+        try:
+            found = self._buffer.lookup_transform(
+                self._options.odom, self._options.base, Time(nanoseconds=stamp_ns))
+        except self._not_yet as error:
+            if now_ns - stamp_ns > PATIENCE_NS:
+                self._pending = None
+                self._refuse('tf_missing', f'no transform {self._options.odom} -> '
+                             f'{self._options.base} at the image: {error}')
+            return
+        self._pending = None
+        try:
+            odom_base = planar_transform(found)
+        except FrameRefusedError as error:
+            self._refuse('tf_pose', str(error))
+            return
+        self._send(stamp_ns, self._options.odom, pose @ odom_base.inverse())
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._listener is not None:
+            self._listener.unregister()
+
+    def _send(self, stamp_ns: int, child: str, pose: Pose2) -> None:
+        message = TransformStamped()
+        tolerance_ns = round(1e9 * self._options.transform_tolerance)
+        message.header.stamp = ns_to_stamp(stamp_ns + tolerance_ns)
+        message.header.frame_id = self._options.map_frame
+        message.child_frame_id = child
+        message.transform.translation.x = float(pose.x)
+        message.transform.translation.y = float(pose.y)
+        message.transform.rotation = yaw_quaternion(float(pose.yaw))
+        self._broadcaster.sendTransform(message)
+
+
+def planar_transform(message: TransformStamped) -> Pose2:
+    """The planar part of a transform.
+
+    :raises FrameRefusedError: if it holds a number that is not finite, or no rotation.
+    """
+    pose = planar_to_pose(Pose2())
+    translation = message.transform.translation
+    pose.position.x, pose.position.y = translation.x, translation.y
+    pose.orientation = message.transform.rotation
+    return pose_to_planar(pose, 'tf')
