@@ -97,16 +97,18 @@ width: 1e-3
 lines:
   - {start: [0, 0], end: [1e0, 2]}
   - {name: "it's: no", start: [0.1, 0, 0.5], end: [.5, 2, 0.5], width: 5e-2, colour: green}
+  - {start: [0, 0, 0], end: [0, 0, 2], width: 0, name: "null"}
 """
     line_map = load_map(map_file(tmp_path, text))
     save_map(line_map, tmp_path / 'again.yaml', comment='saved')
     again = load_map(tmp_path / 'again.yaml')
     assert line_map.frame == again.frame == 'arena'
-    assert [line.name for line in again] == ['line0', "it's: no"]
-    assert [line.colour for line in again] == ['red', 'green']
-    np.testing.assert_array_equal(again.widths, [0.001, 0.05])  # YAML 1.1 reads 1e-3 as a word
-    np.testing.assert_array_equal(again.starts, [[0.0, 0.0, 0.0], [0.1, 0.0, 0.5]])
-    np.testing.assert_array_equal(again.ends, [[1.0, 2.0, 0.0], [0.5, 2.0, 0.5]])
+    assert [line.name for line in again] == ['line0', "it's: no", 'null']
+    assert [line.colour for line in again] == ['red', 'green', 'red']
+    # YAML 1.1 would read 1e-3 as a word
+    np.testing.assert_array_equal(again.widths, [0.001, 0.05, 0.0])
+    np.testing.assert_array_equal(again.starts, [[0.0, 0.0, 0.0], [0.1, 0.0, 0.5], [0, 0, 0]])
+    np.testing.assert_array_equal(again.ends, [[1.0, 2.0, 0.0], [0.5, 2.0, 0.5], [0, 0, 2]])
 
 
 @pytest.mark.parametrize(('old', 'new', 'words'), [
@@ -152,7 +154,7 @@ def test_a_wrong_rig_is_refused_by_key_and_value(
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25]'), ['lines[0].end', '2 or 3 numbers', '1']),
     (MAP.replace('name: east', 'name: south'), ['lines[1].name', 'twice', 'south']),
     (MAP.replace('name: east', 'name: 7'), ['lines[1].name', '7', 'quotes']),
-    (MAP.replace('width: 0.05', 'width: -0.05'), ['width', 'above 0', '-0.05']),
+    (MAP.replace('width: 0.05', 'width: -0.05'), ['width', 'at least 0', '-0.05']),
     (MAP.replace('width: 0.05', 'width: 5 cm'), ['width', 'number in m', '5 cm']),
     (MAP.replace('colour', 'color'), ['color', 'unknown', 'colour']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, -1.65, 0.3]'), ['lines[0]', 'horizontal']),

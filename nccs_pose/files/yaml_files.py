@@ -65,7 +65,7 @@ def load_map(path: str | Path) -> LineMap:
     """
     top = read_yaml(path)
     frame = top.text('frame', 'map')
-    width = top.number('width', 0.0, unit='m', above=0.0)
+    width = top.number('width', 0.0, unit='m', low=0.0)
     colour = top.text('colour', 'green')
     sections = top.sections('lines')
     top.done()
@@ -151,7 +151,7 @@ def _line(section: Section, width: float, colour: str, default_name: str) -> Lin
     for key in ('start', 'end'):
         point = section.numbers(key, (2, 3), unit='m')
         ends.append(point if point.size == 3 else np.append(point, 0.0))
-    width = section.number('width', width, unit='m', above=0.0)
+    width = section.number('width', width, unit='m', low=0.0)
     colour = section.text('colour', colour)
     section.done()
     if np.array_equal(*ends):

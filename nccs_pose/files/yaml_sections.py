@@ -157,16 +157,18 @@ class Section:
         ]
 
     def number(
-        self, key: str, default: Any = _REQUIRED, unit: str = '', above: float | None = None
+        self, key: str, default: Any = _REQUIRED, unit: str = '', above: float | None = None,
+        low: float | None = None,
     ) -> Any:
         accepted = 'a number'
         accepted += f' in {unit}' if unit else ''
         accepted += f' above {above:g}' if above is not None else ''
+        accepted += f', at least {low:g}' if low is not None else ''
         value = self.value(key, default, accepted)
         if value is default and key not in self._content:
             return default
         number = self._finite(key, value, accepted)
-        if above is not None and not number > above:
+        if (above is not None and number <= above) or (low is not None and number < low):
             raise self.error(key, f'must be {accepted}, not {describe(value)}')
         return number
 
