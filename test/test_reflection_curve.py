@@ -80,7 +80,7 @@ def test_degrees_of_the_polynomials(name: str) -> None:
 
 @pytest.mark.parametrize('name', TABLE_ONE)
 def test_gamma_is_reducible(name: str) -> None:
-    """gamma = E^2 g with g of degree 6 (4), as polynomials, coefficient by coefficient."""
+    """As gamma = E^2 g with g of degree 6 (4), coefficient by coefficient."""
     mirror, cop = scaled(*SCENES[name])
     base = mirror_polynomials(mirror, cop)
     *_, degree, monomials = DEGREES[name]

@@ -111,7 +111,7 @@ class MirrorPolynomials:
 
 
 def mirror_polynomials(mirror: QuadricMirror, cop: Array) -> MirrorPolynomials:
-    """The polynomials of a mirror and a centre of projection (3,), which are common to all lines."""
+    """The polynomials of a mirror and a centre of projection (3,), common to all lines."""
     a, b, c = mirror.A, mirror.B, mirror.C
     _, o_y, o_z = (float(v) for v in cop)
     y, z = _poly((1, 0, 1.0)), _poly((0, 1, 1.0))
