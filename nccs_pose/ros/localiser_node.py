@@ -81,7 +81,7 @@ class LocaliserNode(LifecycleNode):
         self._shown: tuple[Any, ...] = ()
         self._reported = (0, 0)
         self._options = NodeOptions()
-        self._parameters = NodeParameters(self, self._on_live_change)
+        self._settings = NodeParameters(self, self._on_live_change)
         self._diagnostics = self.create_publisher(
             DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS))
         self.create_service(Trigger, RELOCALISE.name, self._on_relocalise)
@@ -148,7 +148,7 @@ class LocaliserNode(LifecycleNode):
             self._clean_up()
 
     def _configure(self) -> None:
-        self._options, estimator = self._parameters.options()
+        self._options, estimator = self._settings.options()
         for name in ('rig_file', 'map_file'):
             if not getattr(self._options, name):
                 raise FrameRefusedError('configuration', f'parameter {name} is not set')

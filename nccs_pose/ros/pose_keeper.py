@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 import time
 from typing import Any
 
@@ -26,7 +27,6 @@ from nccs_pose.files.saved_pose import map_hash, read_saved_pose, SavedPose, wri
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.ros.node_options import NodeOptions
-from nccs_pose.ros.resources import resolve
 import numpy as np
 
 
@@ -35,6 +35,7 @@ class PoseKeeper:
 
     def __init__(self, options: NodeOptions, line_map: LineMap, logger: Any) -> None:
         self._options = options
+        self._path = Path(options.saved_pose_file).expanduser()
         self._map_hash = map_hash(line_map)
         self._logger = logger
         self._good: Estimate | None = None
@@ -77,7 +78,7 @@ class PoseKeeper:
         if not self._options.saved_pose_file or good is None:
             return
         try:
-            write_saved_pose(self._options.saved_pose_file, SavedPose(
+            write_saved_pose(self._path, SavedPose(
                 good.stamp_ns, self._options.map_frame, self._map_hash, good.pose,
                 good.covariance))
         except FileError as error:
@@ -85,14 +86,14 @@ class PoseKeeper:
 
     def _read(self) -> SavedPose | None:
         try:
-            saved = read_saved_pose(resolve(self._options.saved_pose_file))
+            saved = read_saved_pose(self._path)
         except FileError as error:
             self._logger.warning(f'the saved pose is not used: {error}')
             return None
         if saved is not None and (
                 saved.map_hash != self._map_hash or saved.frame != self._options.map_frame):
             self._logger.warning(
-                f'the saved pose is not used: {self._options.saved_pose_file} is of another map')
+                f'the saved pose is not used: {self._path} is of another map')
             return None
         return saved
 

@@ -1,0 +1,236 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Plays a bag's topics without rosbag2: recorded timing, serialised messages passed through."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import importlib
+import math
+import sys
+import time
+from typing import Any
+
+from nccs_pose.errors import FileError, NccsPoseError
+from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
+from nccs_pose.ros.conversions import ns_to_stamp
+from nccs_pose.ros.transport import use_large_images
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+
+CLOCK_PERIOD = 0.01
+"""Seconds between two /clock messages."""
+
+OnSent = Callable[[str, bytes], None]
+
+
+@dataclass(frozen=True)
+class Playback:
+    """How to play.
+
+    :ivar rate: speed factor.
+    :ivar loop: begin again at the end, until stopped.
+    :ivar start_offset: seconds of the bag to leave out.
+    :ivar clock: publish /clock.
+    :ivar topics: only these; empty for all.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    start_offset: float = 0.0
+    clock: bool = False
+    topics: tuple[str, ...] = ()
+
+
+class Player:
+    """Publishes the topics of an open bag on a node.
+
+    :ivar sent: messages published, by topic.
+    :ivar skipped: topics that cannot be published here, with the reason.
+    """
+
+    def __init__(self, node: Node, bag: SerialisedBag, playback: Playback) -> None:
+        """Create the publishers.
+
+        :raises FileError: if a topic asked for is not in the bag, or none can be played.
+        """
+        self._node = node
+        self._bag = bag
+        self._playback = playback
+        self.sent: dict[str, int] = {}
+        self.skipped: dict[str, str] = {}
+        self._publishers: dict[str, Publisher] = {}
+        names = {topic.name for topic in bag.topics}
+        missing = [name for name in playback.topics if name not in names]
+        if missing:
+            raise FileError(
+                f'{bag.path}: has no topic {", ".join(missing)}; it has {", ".join(sorted(names))}')
+        for topic in bag.topics:
+            if not playback.topics or topic.name in playback.topics:
+                self._advertise(topic)
+        if not self._publishers:
+            raise FileError(f'{bag.path}: no topic of it can be played')
+        self._clock = node.create_publisher(Clock, '/clock', 10) if playback.clock else None
+
+    def _advertise(self, topic: BagTopic) -> None:
+        try:
+            package, _, name = topic.type.split('/')
+            kind = getattr(importlib.import_module(f'{package}.msg'), name)
+        except (ImportError, AttributeError, ValueError):
+            self.skipped[topic.name] = f'{topic.type} is not installed'
+            self._node.get_logger().warning(
+                f'{topic.name} is skipped: its type {topic.type} is not installed')
+            return
+        profile = QoSProfile(depth=100 if topic.latched else 10)
+        if topic.latched:
+            profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        self._publishers[topic.name] = self._node.create_publisher(kind, topic.name, profile)
+        self.sent[topic.name] = 0
+
+    def subscribers(self, topic: str) -> int:
+        """How many subscribe a topic."""
+        return self._publishers[topic].get_subscription_count()
+
+    def play(self, on_sent: OnSent | None = None) -> None:
+        """Play to the end; returns early when ROS is shut down.
+
+        :param on_sent: called with topic and message right before each is published.
+        """
+        while True:
+            self._play_once(on_sent)
+            if not (self._playback.loop and rclpy.ok()):
+                return
+
+    def _play_once(self, on_sent: OnSent | None) -> None:
+        bag_start = self._bag.start_ns + round(1e9 * self._playback.start_offset)
+        wall_start = time.monotonic()
+        for topic, received_ns, data in self._bag.messages(tuple(self._publishers), bag_start):
+            due = wall_start + 1e-9 * (received_ns - bag_start) / self._playback.rate
+            self._wait_until(due, received_ns)
+            if not rclpy.ok():
+                return
+            if on_sent is not None:
+                on_sent(topic, data)
+            self._publishers[topic].publish(data)
+            self.sent[topic] += 1
+
+    def _wait_until(self, due: float, received_ns: int) -> None:
+        """Sleep; /clock goes on meanwhile."""
+        while rclpy.ok():
+            left = due - time.monotonic()
+            if self._clock is not None:
+                bag_time = received_ns - round(1e9 * max(left, 0.0) * self._playback.rate)
+                self._clock.publish(Clock(clock=ns_to_stamp(bag_time)))
+            if left <= 0.0:
+                return
+            time.sleep(min(left, CLOCK_PERIOD if self._clock is not None else 0.1))
+
+
+def wait_for_subscribers(player: Player, topics: Sequence[str], timeout: float) -> bool:
+    """Wait until each of the topics has a subscriber; false if time runs out or ROS ends."""
+    end = time.monotonic() + timeout
+    while rclpy.ok() and time.monotonic() < end:
+        if all(player.subscribers(topic) for topic in topics):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `ros2 run nccs_pose play BAG`."""
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    options = _parser().parse_args(remove_ros_args(['play', *arguments])[1:])
+    playback = Playback(
+        options.rate, options.loop, options.start_offset, options.clock,
+        tuple(options.topics or ()))
+    use_large_images()
+    try:
+        rclpy.init(args=arguments)
+        with SerialisedBag(options.bag) as bag:
+            node = rclpy.create_node('play')
+            player = Player(node, bag, playback)
+            for topic in options.wait_for or ():
+                if topic not in player.sent:
+                    raise FileError(f'{options.bag}: --wait-for {topic}: is not played')
+            if not wait_for_subscribers(player, options.wait_for or (), options.wait_timeout):
+                if rclpy.ok():
+                    print(f'play: nobody subscribes {", ".join(options.wait_for)}; playing anyway',
+                          file=sys.stderr)
+            player.play()
+            print('played ' + ', '.join(f'{n} x {t}' for t, n in sorted(player.sent.items())))
+    except NccsPoseError as error:
+        print(f'play: {error}', file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        if rclpy.ok():  # else: shut down while publishing
+            raise
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='play', description='Publish the topics of a rosbag2 with their recorded timing. '
+        'Topics are remapped as of any node: --ros-args -r /camera/image_raw:=/image.')
+    parser.add_argument('bag', help='folder of the bag')
+    parser.add_argument('--rate', type=_positive, default=1.0, help='speed factor (default 1)')
+    parser.add_argument('--loop', action='store_true', help='begin again at the end')
+    parser.add_argument('--start-offset', type=_seconds, default=0.0, metavar='S',
+                        help='seconds of the bag to leave out')
+    parser.add_argument('--clock', action='store_true', help='publish /clock, for use_sim_time')
+    parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='only these topics')
+    parser.add_argument('--wait-for', nargs='+', metavar='TOPIC',
+                        help='start when these topics have a subscriber')
+    parser.add_argument('--wait-timeout', type=_seconds, default=20.0, metavar='S',
+                        help='how long to wait for them (default 20)')
+    return parser
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f'{text!r} is no number')
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f'{text} must be greater than 0')
+    return value
+
+
+def _seconds(text: str) -> float:
+    value = _number(text)
+    if value < 0.0:
+        raise argparse.ArgumentTypeError(f'{text} must not be negative')
+    return value
+
+
+if __name__ == '__main__':
+    sys.exit(main())
