@@ -26,14 +26,15 @@ import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import Odometry
 from nccs_pose.errors import FrameRefusedError
+from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.decode import decode_compressed, decode_image
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 IMMOVABLE_VARIANCE = 1e-6
 """Variance of z, roll and pitch, which a planar robot cannot change: m^2, rad^2."""
@@ -183,6 +184,48 @@ def read_initial_pose(
     check_frame('initialpose', 'frame_id', message.header.frame_id, map_frame)
     pose = pose_to_planar(message.pose.pose, 'initialpose')
     return pose, planar_covariance(message.pose.covariance, 'initialpose')
+
+
+def odometry_message(
+    stamp_ns: int, odom: str, base: str, pose: Pose2, forward: float, turn: float,
+) -> Odometry:
+    """Wheel odometry: pose in its own frame, speed (m/s) and turning rate (rad/s)."""
+    message = Odometry(child_frame_id=base)
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = odom
+    message.pose.pose = planar_to_pose(pose)
+    message.twist.twist.linear.x = float(forward)
+    message.twist.twist.angular.z = float(turn)
+    return message
+
+
+def camera_info_message(stamp_ns: int, frame_id: str, camera: PinholeCamera) -> CameraInfo:
+    """The calibration of a camera whose images are not rectified."""
+    message = CameraInfo(
+        width=int(camera.width), height=int(camera.height),
+        distortion_model=camera.distortion_model, d=numbers(camera.distortion or np.zeros(5)),
+        k=numbers(camera.K), r=numbers(np.eye(3)),
+        p=numbers(np.column_stack([camera.K, np.zeros(3)])))
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = frame_id
+    return message
+
+
+def truth_message(stamp_ns: int, frame: str, pose: Pose2) -> PoseStamped:
+    """A true pose."""
+    message = PoseStamped(pose=planar_to_pose(pose))
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = frame
+    return message
+
+
+def compressed_message(stamp_ns: int, frame_id: str, jpeg: bytes) -> CompressedImage:
+    """A JPEG of a colour image."""
+    message = CompressedImage(format='bgr8; jpeg compressed bgr8')
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = frame_id
+    message.data = array.array('B', jpeg)
+    return message
 
 
 def numbers(values: Any) -> list[float]:

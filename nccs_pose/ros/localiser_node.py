@@ -81,7 +81,8 @@ class LocaliserNode(LifecycleNode):
         self._shown: tuple[Any, ...] = ()
         self._reported = (0, 0)
         self._options = NodeOptions()
-        self._settings = NodeParameters(self, self._on_live_change)
+        self._settings = NodeParameters(
+            self, (NodeOptions, LocaliserOptions), self._on_live_change)
         self._diagnostics = self.create_publisher(
             DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS))
         self.create_service(Trigger, RELOCALISE.name, self._on_relocalise)

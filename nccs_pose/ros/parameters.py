@@ -20,21 +20,19 @@ is remembered with the reason and fails the configuration, it never ends the pro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import dataclasses
 import difflib
 from typing import Any
 
 from nccs_pose.errors import OptionError
-from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.options import check_value
-from nccs_pose.ros.node_options import NodeOptions
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-GROUPS: tuple[type, ...] = (NodeOptions, LocaliserOptions)
-_ALIKE = 1e300
+_OPEN = 1e300
 """Bound of a range that is open on this side."""
 
 
@@ -54,26 +52,30 @@ def descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
                 to_value=2**63 - 1 if high is None else int(high), step=0)]
         else:
             result.floating_point_range = [FloatingPointRange(
-                from_value=-_ALIKE if low is None else float(low),
-                to_value=_ALIKE if high is None else float(high), step=0.0)]
+                from_value=-_OPEN if low is None else float(low),
+                to_value=_OPEN if high is None else float(high), step=0.0)]
     return result
 
 
 class NodeParameters:
-    """The node's parameters as the two option values; `refused` says what did not fit.
+    """A node's parameters as option values; `refused` says what did not fit.
 
     :ivar refused: reason by parameter name; not empty means that nothing can be configured.
     """
 
-    def __init__(self, node: Node, apply: Any) -> None:
+    def __init__(
+        self, node: Node, groups: tuple[type, ...], apply: Callable[..., None] | None = None,
+    ) -> None:
         """Declare everything.
 
-        :param apply: called as ``apply(NodeOptions, LocaliserOptions)`` after a live change.
+        :param groups: dataclasses of options; their field names must not repeat.
+        :param apply: called with one value of each group after a live change.
         """
         self._node = node
+        self._groups = groups
         self._apply = apply
         self._fields = {
-            field.name: field for group in GROUPS for field in dataclasses.fields(group)}
+            field.name: field for group in groups for field in dataclasses.fields(group)}
         self.refused: dict[str, str] = {}
         self._overrides = dict(getattr(node, '_parameter_overrides', {}))
         for field in self._fields.values():
@@ -83,8 +85,8 @@ class NodeParameters:
         node.add_on_set_parameters_callback(self._validate)
         node.add_post_set_parameters_callback(self._changed)
 
-    def options(self) -> tuple[NodeOptions, LocaliserOptions]:
-        """The present values.
+    def options(self) -> tuple[Any, ...]:
+        """The present values, one of each group.
 
         :raises OptionError: naming a parameter and what is wrong with it.
         """
@@ -111,7 +113,7 @@ class NodeParameters:
             group(**{
                 field.name: changes.get(field.name, self._node.get_parameter(field.name).value)
                 for field in dataclasses.fields(group)})
-            for group in GROUPS)
+            for group in self._groups)
 
     def _integers_to_floats(self, parameters: list[Parameter]) -> list[Parameter]:
         """`ros2 param set ... 1` is meant for a float as well."""
@@ -135,7 +137,7 @@ class NodeParameters:
         names = [p.name for p in parameters if p.name in self._fields]
         for name in names:
             self.refused.pop(name, None)
-        if names and not self.refused:
+        if self._apply is not None and names and not self.refused:
             self._apply(*self._build({}))
 
     def _warn_of_unknown(self) -> None:

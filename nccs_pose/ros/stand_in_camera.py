@@ -1,0 +1,170 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node `stand_in_camera`: streams the simulated robot live, as the real one would.
+
+Publishes image (or image/compressed), camera_info, odom and ground_truth/pose of a drive along a
+figure of eight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import sys
+import time
+
+import cv2
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from nccs_pose.errors import NccsPoseError
+from nccs_pose.files.yaml_files import load_map, load_rig
+from nccs_pose.options import check_options, option
+from nccs_pose.ros.conversions import (
+    camera_info_message, compressed_message, image_message, odometry_message, truth_message)
+from nccs_pose.ros.parameters import NodeParameters
+from nccs_pose.ros.resources import resolve
+from nccs_pose.ros.transport import use_large_images
+from nccs_pose.simulation.drive import (
+    ImageSample, make_drive, OdometrySample, render_frame, WheelModel)
+from nccs_pose.simulation.motion import figure_of_eight
+from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+SCENES = {'arena': arena_scene, 'ideal': ideal_scene}
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Parameters of the node `stand_in_camera`."""
+
+    rig_file: str = option('config/arena_640_rig.yaml', doc='Rig to render with (YAML).')
+    map_file: str = option('config/arena_map.yaml', doc='Map of the lines (YAML).')
+    scene: str = option(
+        'arena', choices=tuple(SCENES),
+        doc='Look: arena is a room with an ordinary camera, ideal is grey floor and tapes.')
+    rate: float = option(5.0, unit='Hz', low=0.1, high=120.0, doc='Images a second.')
+    duration: float = option(600.0, unit='s', low=1.0, high=7200.0, doc='Length of the drive.')
+    speed: float = option(0.35, unit='m/s', low=0.01, high=3.0, doc='Speed of the robot.')
+    image_transport: str = option(
+        'raw', choices=('raw', 'compressed'), doc='Publish image or image/compressed.')
+    frame_prefix: str = option('', doc='Goes before odom, base_link and camera_optical.')
+    seed: int = option(0, low=0, high=2**31 - 1, doc='Seed of the noise.')
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class StandInCamera(Node):
+    """Renders and publishes, each sample at its stamp."""
+
+    def __init__(self) -> None:
+        super().__init__('stand_in_camera')
+        (self._options,) = NodeParameters(self, (CameraOptions,)).options()
+        o = self._options
+        look = SCENES[o.scene]()
+        self._scene = Scene(
+            load_rig(resolve(o.rig_file)), load_map(resolve(o.map_file)), look.appearance,
+            look.sensor)
+        compressed = o.image_transport == 'compressed'
+        self._image = self.create_publisher(
+            CompressedImage if compressed else Image,
+            'image/compressed' if compressed else 'image', QoSProfile(depth=2))
+        self._info = self.create_publisher(CameraInfo, 'camera_info', QoSProfile(depth=2))
+        self._odometry = self.create_publisher(Odometry, 'odom', QoSProfile(depth=100))
+        self._truth = self.create_publisher(
+            PoseStamped, 'ground_truth/pose', QoSProfile(depth=100))
+        self.skipped = 0
+
+    def drive(self) -> None:
+        """Drive once; a frame that cannot be rendered in time is left out."""
+        o = self._options
+        # The first picture takes longest: what it prepares is kept.
+        trajectory = figure_of_eight(speed=o.speed)
+        frames = max(1, round(o.duration * o.rate))
+        args = (trajectory, frames, o.rate, WheelModel())
+        render_frame(self._scene, make_drive(trajectory, 1, o.rate), 0, o.seed)
+        drive = make_drive(
+            *args, rng=np.random.default_rng(o.seed), start_ns=self.get_clock().now().nanoseconds)
+        samples = [(s.stamp_ns, 0, k) for k, s in enumerate(drive.odometry)]
+        samples += [(stamp_ns, 1, k) for k, stamp_ns in enumerate(drive.stamps_ns)]
+        for stamp_ns, is_image, k in sorted(samples):
+            late = self._wait_until(stamp_ns)
+            if not rclpy.ok():
+                return
+            if not is_image:
+                self._publish_odometry(drive.odometry[k])
+            elif late < 1.0 / o.rate:
+                self._publish_image(render_frame(self._scene, drive, k, o.seed))
+            else:
+                self.skipped += 1
+                self.get_logger().warning(
+                    f'{self.skipped} of {k + 1} frames left out: this machine renders slower '
+                    f'than {o.rate:g} Hz', throttle_duration_sec=10.0)
+
+    def _wait_until(self, stamp_ns: int) -> float:
+        """Serve parameters and the like until a time; returns how late it is, seconds."""
+        while rclpy.ok():
+            left = 1e-9 * (stamp_ns - self.get_clock().now().nanoseconds)
+            if left <= 0.0:
+                return -left
+            started = time.monotonic()
+            rclpy.spin_once(self, timeout_sec=min(left, 0.1))
+            # Nothing to spin for is no reason to spin.
+            time.sleep(max(0.0, min(left, 0.002) - (time.monotonic() - started)))
+        return 0.0
+
+    def _publish_odometry(self, sample: OdometrySample) -> None:
+        prefix = self._options.frame_prefix
+        self._odometry.publish(odometry_message(
+            sample.stamp_ns, prefix + 'odom', prefix + 'base_link', sample.pose,
+            sample.twist.forward, sample.twist.turn))
+
+    def _publish_image(self, sample: ImageSample) -> None:
+        frame = self._options.frame_prefix + 'camera_optical'
+        if self._options.image_transport == 'compressed':
+            jpeg = cv2.imencode('.jpg', sample.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+            self._image.publish(compressed_message(sample.stamp_ns, frame, jpeg.tobytes()))
+        else:
+            self._image.publish(image_message(sample.stamp_ns, frame, sample.image))
+        self._info.publish(camera_info_message(sample.stamp_ns, frame, self._scene.rig.camera))
+        self._truth.publish(truth_message(sample.stamp_ns, 'map', sample.pose))
+
+
+def main() -> int:
+    """Entry point of `ros2 run nccs_pose stand_in_camera`."""
+    use_large_images()
+    try:
+        rclpy.init()
+        node = StandInCamera()
+        node.drive()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except NccsPoseError as error:
+        print(f'stand_in_camera: {error}', file=sys.stderr)
+        return 2
+    except Exception:
+        if rclpy.ok():  # else: shut down in the middle of publishing
+            raise
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
