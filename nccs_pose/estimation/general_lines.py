@@ -1,0 +1,128 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""All poses for lines in general position, without an initial guess.
+
+For a fixed yaw S is linear in (x, y), so the 7 x 7 Gram matrix G of its monomials gives the best
+cost at that yaw as a ratio of two determinants: with the monomials written V(yaw) (x, y, 1) and
+Q = V^T G V (3 x 3),
+
+    J(yaw) = N / D,   N = det Q,   D = det Q[:2, :2].
+
+N is a trigonometric polynomial of degree 4 and D one of degree 2 (the entries of Q have degree
+2, but the highest terms cancel), so J' = 0 is one of degree 6: its at most 12 roots on the unit
+circle z = exp(i yaw) are all stationary points, and nothing is searched for. Sixteen samples of
+the yaw determine both polynomials exactly.
+"""
+
+from __future__ import annotations
+
+import math
+
+from nccs_pose.estimation.closed_form import (
+    horizontal_minima,
+    inverse_2x2,
+    ROUNDING,
+    vertical_minima,
+)
+from nccs_pose.estimation.pose_monomials import Minimum
+from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
+from numpy.typing import NDArray
+
+# A line is horizontal or vertical when its direction is so up to this (rad).
+ALIGNED = 1e-9
+# A root this close to the unit circle is a real yaw: two that nearly meet leave it by the root
+# of their rounding.
+_ON_CIRCLE = 1e-4
+_YAWS = 2.0 * math.pi * np.arange(16) / 16
+
+
+def _parametrisation(yaws: Array) -> Array:
+    """V (K, 7, 3): the monomials at each yaw (K,) as a form in (x, y, 1)."""
+    c, s, v = np.cos(yaws), np.sin(yaws), np.zeros((len(yaws), 7, 3))
+    v[:, 0, 2], v[:, 1, 2] = c, s
+    v[:, 2, 0] = v[:, 3, 1] = v[:, 6, 2] = 1.0
+    v[:, 4, 0], v[:, 4, 1] = c, s
+    v[:, 5, 0], v[:, 5, 1] = -s, c
+    return v
+
+
+_SAMPLES = _parametrisation(_YAWS)
+_SAMPLES_T = np.ascontiguousarray(np.swapaxes(_SAMPLES, 1, 2))
+
+
+def general_minima(gram: Array) -> tuple[Minimum, ...]:
+    """All local minima, the global one first, for any lines but all horizontal or all vertical.
+
+    :param gram: Gram matrix of S (7, 7).
+    """
+    q = _SAMPLES_T @ gram @ _SAMPLES
+    minor = q[:, 0, 0] * q[:, 1, 1] - q[:, 0, 1] ** 2
+    full = (
+        minor * q[:, 2, 2]
+        - q[:, 0, 0] * q[:, 1, 2] ** 2 - q[:, 1, 1] * q[:, 0, 2] ** 2
+        + 2.0 * q[:, 0, 1] * q[:, 0, 2] * q[:, 1, 2])
+    # Fourier coefficients from -degree to degree; the rest is zero but for rounding.
+    n = np.fft.fft(full)[np.arange(-4, 5)]
+    d = np.fft.fft(minor)[np.arange(-2, 3)]
+    slope = (np.convolve(1j * np.arange(-4, 5) * n, d) - np.convolve(n, 1j * np.arange(-2, 3) * d))
+    yaws = _minima_of_slope(slope)
+    minima = [_minimum_at(gram, yaw) for yaw in yaws.tolist()]
+    if not minima:
+        # Flat up to rounding: any yaw is as good.
+        minima = [_minimum_at(gram, yaw) for yaw in _YAWS.tolist()]
+        return (min(minima, key=lambda m: m.cost),)
+    return tuple(sorted(minima, key=lambda m: m.cost))
+
+
+def _minima_of_slope(slope: NDArray[np.complex128]) -> Array:
+    """Yaws where a real trigonometric polynomial crosses zero upwards.
+
+    :param slope: its Fourier coefficients from -degree to degree (2 degree + 1,).
+    """
+    size = np.abs(slope)
+    strong = np.flatnonzero(size > ROUNDING * size.max())
+    if not len(strong) or strong[0] == len(slope) // 2:
+        return np.empty(0)
+    degree = len(slope) // 2 - int(strong[0])
+    slope = slope[strong[0]:len(slope) - strong[0]]
+    companion = np.eye(2 * degree, k=-1, dtype=complex)
+    companion[0] = -slope[-2::-1] / slope[-1]
+    roots = np.linalg.eigvals(companion)
+    yaws = np.angle(roots[np.abs(np.abs(roots) - 1.0) < _ON_CIRCLE])
+    harmonics = np.arange(-degree, degree + 1)
+    curvature = (np.exp(1j * yaws[:, None] * harmonics) @ (1j * harmonics * slope)).real
+    return yaws[curvature > 0.0]
+
+
+def _minimum_at(gram: Array, yaw: float) -> Minimum:
+    """The best translation for a yaw."""
+    v = _parametrisation(np.array([yaw]))[0]
+    q = v.T @ gram @ v
+    x, y = (-inverse_2x2(q[:2, :2]) @ q[:2, 2]).tolist()
+    return Minimum(Pose2(x, y, yaw), float(np.array([x, y, 1.0]) @ q @ (x, y, 1.0)))
+
+
+def all_minima(gram: Array, directions: Array) -> tuple[Minimum, ...]:
+    """All local minima by the method that fits the lines, the global one first.
+
+    :param gram: Gram matrix of S (7, 7).
+    :param directions: unit directions of the lines (L, 3).
+    """
+    if (np.abs(directions[:, 2]) <= ALIGNED).all():
+        return horizontal_minima(gram)
+    if (np.abs(directions[:, :2]) <= ALIGNED).all():
+        return vertical_minima(gram)
+    return general_minima(gram)

@@ -1,0 +1,194 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""All poses that labelled rays allow, found without an initial guess.
+
+First every local minimum of the unweighted sum of squares of S, in closed form; then at each of
+them S is weighted by its own variance and the problem solved again, which reaches the
+Cramér-Rao bound. Poses that the pixels cannot tell from the best are returned with it. What is
+found is meant to be refined in pixels, robustly, by :func:`nccs_pose.estimation.refine.refine`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from nccs_pose.errors import EstimationError
+from nccs_pose.estimation.general_lines import all_minima
+from nccs_pose.estimation.labelled_rays import LabelledRays
+from nccs_pose.estimation.observability import (
+    Symmetry,
+    symmetry,
+    Unobserved,
+    unobserved_directions,
+)
+from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.rig import Rays
+import numpy as np
+from numpy.typing import ArrayLike
+
+# Poses whose chi-square exceeds the best one's by no more than this are its equals (4 sigma).
+_EQUALLY_GOOD = 16.0
+# Weights can bring a minimum down, but not so many times.
+_HOPELESS = 100.0
+# Poses closer than this many standard deviations are one.
+_SAME_POSE = 1.0
+# A pose is virtual when so many more rays than for another meet their lines behind the mirror.
+_VIRTUAL = 0.1
+# Weights are taken again from a pose that has turned further than this (rad), so many times.
+_CLOSE_START = 0.1
+_REWEIGHTINGS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One pose that the rays allow.
+
+    :ivar pose: T_map_base. Along an unobserved direction it is one of many.
+    :ivar chi2: sum of squared whitened residuals.
+    :ivar information: of (x, y, yaw) at the pose (3, 3), with the noise as told.
+    :ivar covariance: its inverse; None with an unobserved direction.
+    :ivar unobserved: directions that are not fixed, worst first; empty when all are.
+    :ivar symmetry: of the lines that have rays.
+    """
+
+    pose: Pose2
+    chi2: float
+    information: Array
+    covariance: Array | None
+    unobserved: tuple[Unobserved, ...]
+    symmetry: Symmetry
+
+
+def solve(
+    rays: Rays,
+    directions: ArrayLike,
+    moments: ArrayLike,
+    label: ArrayLike,
+    *,
+    sigma: ArrayLike = 1.0,
+    sigma_world: float = 0.0,
+) -> tuple[Solution, ...]:
+    """All poses that N labelled rays allow, best first; more than one when they are equals.
+
+    :param rays: in base_link (N,); those that missed the mirror are left out.
+    :param directions: directions of the map's lines (L, 3), of any length but zero.
+    :param moments: their moments q x d (L, 3), with the same d.
+    :param label: index of the line that each ray should meet (N,); negative ones are left out.
+    :param sigma: standard deviation of the pixels along the curve's normal, px, (N,) or one.
+    :param sigma_world: standard deviation of the lines' own position across themselves, metres.
+    :raises EstimationError: without lines, with fewer than three pixels, for a value that is
+        not finite, a direction of length zero, a sigma that is not positive or a label that is
+        no line's, or when every pose that fits has its lines behind the mirror.
+    """
+    data = LabelledRays(rays, directions, moments, label, sigma, sigma_world)
+    found: list[_Found] = []
+    for start in all_minima(gram(data.rows, 1.0 / data.sigma2), data.directions):
+        if found and _chi2(data, start.pose) > _HOPELESS * _limit(found, len(data)):
+            continue
+        solution = _weighted(data, start.pose)
+        if not any(_same(solution, other) for other in found):
+            found.append(solution)
+    found = _equally_good(found, len(data))
+    lines = symmetry(data.directions, data.moments).shifted(data.origin)
+    return tuple(_solution(entry, lines, data.origin) for entry in found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A pose about the data's own origin."""
+
+    pose: Pose2
+    chi2: float
+    information: Array
+    in_front: float
+
+
+def _equally_good(found: list[_Found], n_rays: int) -> list[_Found]:
+    """The poses with their lines in front that the pixels cannot tell from the best of them."""
+    most = max(entry.in_front for entry in found)
+    if most < 0.5:
+        raise EstimationError(
+            f'every pose that fits has its lines behind the mirror ({100 * (1 - most):.0f} % of '
+            'the rays): the mounting or the labels are wrong')
+    found = [entry for entry in found if entry.in_front >= most - _VIRTUAL]
+    limit = _limit(found, n_rays)
+    return sorted((entry for entry in found if entry.chi2 <= limit), key=lambda e: e.chi2)
+
+
+def _limit(found: list[_Found], n_rays: int) -> float:
+    """Chi-square of a pose that is just as good as the best one found.
+
+    With more noise than told, differences of chi-square mean less in proportion.
+    """
+    best = min(entry.chi2 for entry in found)
+    return best + _EQUALLY_GOOD * max(1.0, best / max(1, n_rays - 3))
+
+
+def _chi2(data: LabelledRays, pose: Pose2) -> float:
+    s = data.rows @ monomials(pose)
+    return float((s * s / data.variance(pose)).sum())
+
+
+def _weighted(data: LabelledRays, pose: Pose2) -> _Found:
+    """The pose that a minimum of the unweighted sum becomes with S weighted by its variance.
+
+    Once is enough for the best minimum. Another may have been far off, and so its weights.
+    """
+    for _ in range(_REWEIGHTINGS):
+        weights = 1.0 / data.variance(pose)
+        minima = all_minima(gram(data.rows, weights), data.directions)
+        before = pose
+        pose = min(minima, key=lambda m: abs(_difference(m.pose.yaw, before.yaw))).pose
+        if abs(_difference(pose.yaw, before.yaw)) < _CLOSE_START:
+            break
+    return _polished(data, weights, pose)
+
+
+def _polished(data: LabelledRays, weights: Array, pose: Pose2) -> _Found:
+    """One Gauss-Newton step on the rows, which the Gram matrix knows to half their digits."""
+    jacobian = data.rows @ monomials_jacobian(pose)
+    weighted = jacobian * weights[:, None]
+    information = weighted.T @ jacobian
+    values, vectors = np.linalg.eigh(information)
+    # Where the rays say nothing the pose stays.
+    heard = values > 1e-12 * values[-1]
+    slope = vectors.T @ (weighted.T @ (data.rows @ monomials(pose)))
+    step = vectors[:, heard] @ (slope[heard] / values[heard])
+    pose = Pose2.from_array(pose.as_array() - step)
+    s = data.rows @ monomials(pose)
+    return _Found(pose, float(weights @ (s * s)), information, data.in_front(pose))
+
+
+def _same(a: _Found, b: _Found) -> bool:
+    """Whether two poses are one up to the noise, as far as the better of them tells."""
+    better = a if a.chi2 < b.chi2 else b
+    step = a.pose.as_array() - b.pose.as_array()
+    step[2] = _difference(a.pose.yaw, b.pose.yaw)
+    return bool(step @ better.information @ step < _SAME_POSE**2) and abs(step[2]) < 0.5 * math.pi
+
+
+def _difference(a: float, b: float) -> float:
+    return math.remainder(a - b, 2.0 * math.pi)
+
+
+def _solution(found: _Found, lines: Symmetry, origin: Array) -> Solution:
+    pose = Pose2(found.pose.x + origin[0], found.pose.y + origin[1], found.pose.yaw)
+    unobserved = unobserved_directions(found.information, pose)
+    covariance = None
+    if not unobserved:
+        covariance = np.asarray(np.linalg.inv(found.information), dtype=float)
+    return Solution(pose, found.chi2, found.information, covariance, unobserved, lines)
