@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-import shutil
 
 from calibration_reader import read_calibration
 import cv2
@@ -343,15 +342,3 @@ def test_an_uncalibrated_camera_info_is_no_camera(tmp_path: Path) -> None:
         tmp_path / 'bag', '/camera_info', 'sensor_msgs/msg/CameraInfo', info)
     with BagReader(path) as reader:
         assert reader.camera() is None
-
-
-def test_serialised_messages_are_the_recorded_bytes(tmp_path: Path) -> None:
-    copy = tmp_path / 'room'
-    shutil.copytree(ROOM, copy)
-    with BagReader(copy) as reader:
-        messages = list(reader.serialised())
-    assert len(messages) == 1403
-    with Reader(ROOM) as plain:
-        assert [(m[0], m[2], m[3]) for m in messages[:50]] == [
-            (connection.topic, received, bytes(data))
-            for (connection, received, data), _ in zip(plain.messages(), range(50))]

@@ -14,7 +14,7 @@
 """Bags of ROS 2 (and 1) read without ROS, by rosbags.
 
 `BagReader` gives what the localiser needs, in the order in which it was recorded; `BagWriter`
-(bag_writer.py) writes the same topics.
+(bag_writer.py) writes the same topics; serialised_bag.py hands out messages as they are.
 """
 
 from __future__ import annotations
@@ -148,12 +148,6 @@ class BagReader:
         if self.topics.odom is None:
             return Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
         return self._trajectory(self.topics.odom)
-
-    def serialised(self) -> Iterator[tuple[str, str, int, bytes]]:
-        """Topic, type, time of reception (ns) and CDR bytes of every message, by time."""
-        with self._words():
-            for connection, received, data in self._reader.messages():
-                yield connection.topic, connection.msgtype, received, data
 
     def _trajectory(self, topic: str) -> Trajectory:
         rows = [

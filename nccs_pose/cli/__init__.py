@@ -1,0 +1,60 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The command line `nccs-pose`: parse, call a command, say in one sentence what went wrong.
+
+Exit codes: 0 it worked; 1 it ran, and the result is bad (e.g. no frame was answered); 2 the
+input or the usage is wrong; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+import sys
+
+from nccs_pose.cli.parser import find_command, parse
+from nccs_pose.errors import NccsPoseError
+
+__all__ = ['main']
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    :param argv: arguments without the program's name; the process's own if not given.
+    :returns: the exit code.
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    command = find_command(argv)
+    name = f'nccs-pose {command.name}' if command else 'nccs-pose'
+    try:
+        return parse(argv).run()
+    except SystemExit as stop:  # argparse, after it has printed help or usage
+        return stop.code if isinstance(stop.code, int) else 2
+    except NccsPoseError as error:
+        print(f'{name}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f'{name}: interrupted.', file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # e.g. `nccs-pose ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except ModuleNotFoundError as error:
+        if (error.name or '').startswith('nccs_pose'):
+            raise
+        print(
+            f'{name}: needs the Python package {error.name}, which is not installed '
+            '(see requirements.txt).', file=sys.stderr)
+        return 2

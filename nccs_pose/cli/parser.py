@@ -1,0 +1,116 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The commands and their arguments; a command's module is imported only when it is called."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Command:
+    """One word after `nccs-pose`.
+
+    :ivar module: defines `add_arguments(parser)` and `run(args) -> int`.
+    :ivar summary: what it does, in one line.
+    :ivar example: how it is called.
+    """
+
+    name: str
+    module: str
+    summary: str
+    example: str
+
+    def load(self) -> Any:
+        """Import the command's module."""
+        return import_module(self.module)
+
+
+_FORMAT = argparse.RawDescriptionHelpFormatter  # keeps examples on their own lines
+_ROOM = '--rig config/room_rig.yaml --map config/room_map.yaml'
+COMMANDS = (
+    Command('replay', 'nccs_pose.cli.replay',
+            'run the localiser over a bag, without ROS, and evaluate it',
+            f'nccs-pose replay bags/room {_ROOM} --output out/poses.tum --plots out'),
+    Command('evaluate', 'nccs_pose.cli.evaluate',
+            'compare a trajectory with the true one',
+            'nccs-pose evaluate out/poses.tum truth.tum --plots out'),
+    Command('render', 'nccs_pose.cli.render',
+            'simulate a drive and write it as a bag, with its rig and map',
+            'nccs-pose render out/arena --frames 50'),
+    Command('calibrate', 'nccs_pose.cli.calibrate',
+            'refine a rough rig from the lines that a driven bag shows',
+            'nccs-pose calibrate bags/room --rig rough.yaml --map config/room_map.yaml '
+            '--output out/rig.yaml'),
+    Command('check', 'nccs_pose.cli.check',
+            'tell whether a rig is still true to a bag',
+            f'nccs-pose check bags/room {_ROOM}'),
+    Command('experiment', 'nccs_pose.evaluation.experiments',
+            "repeat the paper's experiments",
+            'nccs-pose experiment --help'),
+    Command('benchmark', 'nccs_pose.evaluation.benchmark',
+            'measure what a frame costs, stage by stage',
+            'nccs-pose benchmark'),
+    Command('faults', 'nccs_pose.cli.faults',
+            'play every named fault through the localiser and count what it makes of it',
+            'nccs-pose faults'),
+)
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command with its parsed arguments."""
+
+    command: Command
+    arguments: argparse.Namespace
+
+    def run(self) -> int:
+        """Do it; returns the exit code."""
+        return self.command.load().run(self.arguments)
+
+
+def find_command(argv: Sequence[str]) -> Command | None:
+    """The command that the arguments name, if any."""
+    word = next((argument for argument in argv if not argument.startswith('-')), None)
+    return next((command for command in COMMANDS if command.name == word), None)
+
+
+def parse(argv: Sequence[str]) -> Call:
+    """Parse the arguments; only the chosen command's own module is imported.
+
+    :raises SystemExit: as argparse does, after printing help (0) or usage (2).
+    """
+    chosen = find_command(argv)
+    parser = argparse.ArgumentParser(
+        prog='nccs-pose',
+        description='Planar localisation from the floor lines that a catadioptric camera sees.',
+        epilog=f'example: {COMMANDS[0].example}\n\n'
+               'Every command explains itself with --help. Exit codes: 0 ok, 1 the result is bad, '
+               '2 wrong usage or input.',
+        formatter_class=_FORMAT)
+    words = parser.add_subparsers(dest='command', metavar='COMMAND', title='commands')
+    for command in COMMANDS:
+        word = words.add_parser(
+            command.name, help=command.summary, description=f'{command.summary.capitalize()}.',
+            epilog=f'example: {command.example}', formatter_class=_FORMAT)
+        if command is chosen:
+            command.load().add_arguments(word)
+    arguments = parser.parse_args(argv)
+    if chosen is None:
+        parser.error('name a command: ' + ', '.join(command.name for command in COMMANDS))
+    return Call(chosen, arguments)
