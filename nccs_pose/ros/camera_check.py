@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Does the camera that publishes camera_info look like the one that the rig was calibrated with?"""
+"""Is the camera that publishes camera_info the one that the rig was calibrated with?"""
 
 from __future__ import annotations
 

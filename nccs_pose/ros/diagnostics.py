@@ -119,7 +119,8 @@ def pose_status(
     if estimate.covariance is not None:
         for key, variance in zip(('x_m', 'y_m', 'yaw_rad'), estimate.covariance.diagonal()):
             values[f'sigma_{key}'] = math.sqrt(float(variance))
-    return status(name, LEVELS[estimate.state], f'{estimate.state.value}: {estimate.reason}', values)
+    words = f'{estimate.state.value}: {estimate.reason}'
+    return status(name, LEVELS[estimate.state], words, values)
 
 
 def image_status(

@@ -77,3 +77,41 @@ RELOCALISE = Endpoint(
 SET_PAUSED = Endpoint(
     '~/set_paused', 'std_srvs/srv/SetBool', 'Stop (true) or resume (false) using images.')
 SERVICES = (RELOCALISE, SET_PAUSED)
+
+TF_MODES = (
+    ('`none`', 'anything', 'nothing'),
+    ('`map_to_odom`', 'odom -> base_link',
+     "map -> odom, so that map -> base_link at the image's stamp is the estimate"),
+    ('`map_to_base`', 'nothing above base_link', 'map -> base_link'),
+)
+"""tf_mode, and who broadcasts what."""
+
+STATUSES = (
+    ('`localiser: pose`',
+     'lifecycle, state (`searching`, `ambiguous`, `tracking`, `coasting`, `lost`; `stopped`, '
+     '`withheld`), reason, age_s, lines_used, points_used, residual_px, expected_px, explained, '
+     'claimed, ambiguity, unobserved, candidates, sigma_x_m, sigma_y_m, sigma_yaw_rad'),
+    ('`localiser: images`',
+     'topic, frames_received, frames_answered, frames_dropped_busy, frames_lost_by_middleware, '
+     'refused and refused.*cause*, errors and error.*function*, last_refusal, last_error'),
+    ('`localiser: time`',
+     'decode_ms, predict_ms, detect_ms, associate_ms, measure_ms, refine_ms, total_ms, '
+     'arrival_to_answer_ms'),
+)
+"""The statuses in /diagnostics and their values."""
+
+CAUSES = (
+    ('`image_data`', 'an image of unknown encoding, whose step, size and data do not fit, or '
+     'that cannot be decoded'),
+    ('`image_size`, `image_type`', "an image that is not of the rig's size; no 8-bit colour image"),
+    ('`duplicate_stamp`, `out_of_order`',
+     'an image with the stamp of the last one, or an earlier one'),
+    ('`camera_info`', 'a camera_info that contradicts the rig'),
+    ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite, or '
+     'no rotation'),
+    ('`initialpose_frame`, `initialpose_pose`, `initialpose_covariance`',
+     'an initial pose in another frame; not finite or no rotation; whose covariance is none'),
+    ('`tf_missing`, `tf_pose`', 'an estimate whose odometry transform did not come within 1 s; a '
+     'transform that is none'),
+)
+"""Words by which refused messages are counted."""

@@ -38,7 +38,14 @@ from nccs_pose.ros.camera_check import contradiction
 from nccs_pose.ros.conversions import read_initial_pose, read_odometry
 from nccs_pose.ros.image_stream import ImageStream
 from nccs_pose.ros.interface import (
-    CAMERA_INFO, DIAGNOSTICS, Endpoint, INITIAL_POSE, ODOM, RELOCALISE, SET_PAUSED)
+    CAMERA_INFO,
+    DIAGNOSTICS,
+    Endpoint,
+    INITIAL_POSE,
+    ODOM,
+    RELOCALISE,
+    SET_PAUSED,
+)
 from nccs_pose.ros.lifecycle import answer_every_request, in_words
 from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
@@ -97,9 +104,9 @@ class LocaliserNode(LifecycleNode):
 
     def autostart(self) -> None:
         """Configure and activate, if the parameter says so."""
-        if self.get_parameter('autostart').value:
-            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-                self.trigger_activate()
+        if (self.get_parameter('autostart').value
+                and self.trigger_configure() == TransitionCallbackReturn.SUCCESS):
+            self.trigger_activate()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check rig, map and parameters."""

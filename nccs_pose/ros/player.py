@@ -23,7 +23,6 @@ import importlib
 import math
 import sys
 import time
-from typing import Any
 
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
@@ -83,7 +82,8 @@ class Player:
         missing = [name for name in playback.topics if name not in names]
         if missing:
             raise FileError(
-                f'{bag.path}: has no topic {", ".join(missing)}; it has {", ".join(sorted(names))}')
+                f'{bag.path}: has no topic {", ".join(missing)}; '
+                f'it has {", ".join(sorted(names))}')
         for topic in bag.topics:
             if not playback.topics or topic.name in playback.topics:
                 self._advertise(topic)
@@ -171,10 +171,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             for topic in options.wait_for or ():
                 if topic not in player.sent:
                     raise FileError(f'{options.bag}: --wait-for {topic}: is not played')
-            if not wait_for_subscribers(player, options.wait_for or (), options.wait_timeout):
-                if rclpy.ok():
-                    print(f'play: nobody subscribes {", ".join(options.wait_for)}; playing anyway',
-                          file=sys.stderr)
+            waited = wait_for_subscribers(player, options.wait_for or (), options.wait_timeout)
+            if rclpy.ok() and not waited:
+                print(f'play: nobody subscribes {", ".join(options.wait_for)}; playing anyway',
+                      file=sys.stderr)
             player.play()
             print('played ' + ', '.join(f'{n} x {t}' for t, n in sorted(player.sent.items())))
     except NccsPoseError as error:

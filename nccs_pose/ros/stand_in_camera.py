@@ -31,12 +31,22 @@ from nccs_pose.errors import NccsPoseError
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.options import check_options, option
 from nccs_pose.ros.conversions import (
-    camera_info_message, compressed_message, image_message, odometry_message, truth_message)
+    camera_info_message,
+    compressed_message,
+    image_message,
+    odometry_message,
+    truth_message,
+)
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.resources import resolve
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import (
-    ImageSample, make_drive, OdometrySample, render_frame, WheelModel)
+    ImageSample,
+    make_drive,
+    OdometrySample,
+    render_frame,
+    WheelModel,
+)
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 import numpy as np

@@ -28,8 +28,7 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from nccs_pose.errors import FrameRefusedError, OptionError
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.ros.conversions import (
-    ns_to_stamp, planar_to_pose, pose_to_planar, yaw_quaternion)
+from nccs_pose.ros.conversions import ns_to_stamp, planar_to_pose, pose_to_planar, yaw_quaternion
 from nccs_pose.ros.node_options import NodeOptions
 from rclpy.node import Node
 from rclpy.time import Time
@@ -44,7 +43,9 @@ class TransformOutput:
     :raises OptionError: if transforms are asked for and tf2_ros is not installed.
     """
 
-    def __init__(self, node: Node, options: NodeOptions, refuse: Callable[[str, str], None]) -> None:
+    def __init__(
+        self, node: Node, options: NodeOptions, refuse: Callable[[str, str], None],
+    ) -> None:
         """Create the broadcaster, and the listener where one is needed.
 
         :param refuse: called with cause and words when a transform could not be made.
