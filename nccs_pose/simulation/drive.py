@@ -106,6 +106,12 @@ class Drive:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def order(self) -> Iterator[tuple[bool, int]]:
+        """Give (is image, number of the image or report) by stamp, reports before images."""
+        reports = ((sample.stamp_ns, False, k) for k, sample in enumerate(self.odometry))
+        images = ((stamp, True, k) for k, stamp in enumerate(self.stamps_ns))
+        return ((is_image, k) for _, is_image, k in heapq.merge(reports, images))
+
 
 def make_drive(
     trajectory: Trajectory,
@@ -173,10 +179,8 @@ def stream(scene: Scene, drive: Drive, seed: int = 0) -> Iterator[Sample]:
     A frame's noise depends on the seed and its number alone, so that any frame can be rendered
     again by itself with `render_frame`.
     """
-    images = ((stamp, 1, k) for k, stamp in enumerate(drive.stamps_ns))
-    reports = ((sample.stamp_ns, 0, k) for k, sample in enumerate(drive.odometry))
-    for _, kind, k in heapq.merge(images, reports):
-        yield render_frame(scene, drive, k, seed) if kind else drive.odometry[k]
+    for is_image, k in drive.order():
+        yield render_frame(scene, drive, k, seed) if is_image else drive.odometry[k]
 
 
 def render_frame(scene: Scene, drive: Drive, frame: int, seed: int = 0) -> ImageSample:

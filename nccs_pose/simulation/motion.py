@@ -140,12 +140,18 @@ class Loop:
 
 
 def figure_of_eight(
-    length: float = 2.2, width: float = 1.3, speed: float = 0.35, centre: ArrayLike = (0.0, 0.0)
+    length: float = 2.2, width: float = 1.3, speed: float = 0.35, phase: float = 0.0
 ) -> Loop:
-    """Give a lying figure of eight about `centre`, m and m/s: turns both ways, crosses itself."""
-    phase = np.arange(16) * (2.0 * np.pi / 16)
-    points = np.stack([0.5 * length * np.sin(phase), 0.5 * width * np.sin(2.0 * phase)], axis=1)
-    return Loop(points + np.asarray(centre, dtype=float), speed)
+    """Give a lying figure of eight about the map's origin: turns both ways, crosses itself.
+
+    :param length: along x, m.
+    :param width: along y, m.
+    :param speed: m/s.
+    :param phase: where it begins: 0 in the middle, -pi/2 at the end of least x, rad.
+    """
+    angle = phase + np.arange(16) * (2.0 * np.pi / 16)
+    points = np.stack([0.5 * length * np.sin(angle), 0.5 * width * np.sin(2.0 * angle)], axis=1)
+    return Loop(points, speed)
 
 
 def random_loop(

@@ -1,0 +1,189 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a localiser makes of every fault, counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+from typing import Protocol
+
+from nccs_pose.errors import FrameRefusedError
+from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.evaluation.tables import table
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.rig import Rig
+from nccs_pose.simulation.drive import ImageSample
+from nccs_pose.simulation.faults import Fault, prepare, Rehearsal
+import numpy as np
+
+# Closer than both of these is right, whatever the covariance says.
+RIGHT_DISTANCE = 0.05
+RIGHT_ANGLE = math.radians(1.0)
+# Standard deviations (of the error as a whole) that a pose may be off by its own covariance.
+RIGHT_SIGMAS = 5.0
+
+
+class Answering(Protocol):
+    """What a localiser must be able to do."""
+
+    def process(self, stamp_ns: int, image: np.ndarray) -> Estimate:
+        """Answer an image; may refuse it with a FrameRefusedError."""
+
+    def add_odometry(self, stamp_ns: int, pose: Pose2) -> object:
+        """Take notice of the wheels."""
+
+
+@dataclass(frozen=True)
+class FaultRow:
+    """One fault, played once.
+
+    :ivar fault: which.
+    :ivar frames: images that arrived.
+    :ivar answered: answered with a pose.
+    :ivar wrong: of these, off by more than 5 sigma and by more than 50 mm or 1 degree.
+    :ivar refused: images that the localiser would not use.
+    :ivar recovered: how many images after the fault the first right pose came (1: at once);
+        None if it never came or the fault never ended.
+    :ivar worst_distance: largest translation error of all answers, m; NaN without any.
+    :ivar worst_angle: largest yaw error, rad.
+    """
+
+    fault: Fault
+    frames: int
+    answered: int
+    wrong: int
+    refused: int
+    recovered: int | None
+    worst_distance: float
+    worst_angle: float
+
+    @property
+    def lost(self) -> int:
+        """Images that were looked at and gave no pose."""
+        return self.frames - self.answered - self.refused
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """One image's outcome: errors in m and rad, NaN without a pose; sigmas off."""
+
+    after: bool
+    refused: bool = False
+    distance: float = math.nan
+    angle: float = math.nan
+    sigmas: float = math.nan
+
+    @property
+    def given(self) -> bool:
+        return not math.isnan(self.distance)
+
+    @property
+    def right(self) -> bool:
+        return self.given and self.distance <= RIGHT_DISTANCE and self.angle <= RIGHT_ANGLE
+
+    @property
+    def wrong(self) -> bool:
+        # A covariance that is none (not finite) excuses nothing.
+        return self.given and not self.right and not self.sigmas <= RIGHT_SIGMAS
+
+
+def run_fault(
+    fault: Fault, rehearsal: Rehearsal, localiser: Callable[[Rig, LineMap], Answering],
+) -> FaultRow:
+    """Play a fault to a fresh localiser and count what it makes of it.
+
+    :param fault: which.
+    :param rehearsal: the drive that it spoils.
+    :param localiser: makes one from a rig and a map.
+    """
+    play = prepare(fault, rehearsal)
+    answering = localiser(play.scene.rig, play.line_map)
+    answers = []
+    for event in play.events():
+        sample = event.sample
+        if isinstance(sample, ImageSample):
+            answers.append(_answer(answering, sample, event.after))
+        else:
+            answering.add_odometry(sample.stamp_ns, sample.pose)
+    return _count(fault, answers)
+
+
+def _answer(localiser: Answering, sample: ImageSample, after: bool) -> _Answer:
+    try:
+        estimate = localiser.process(sample.stamp_ns, sample.image)
+    except FrameRefusedError:
+        return _Answer(after, refused=True)
+    if estimate.pose is None or estimate.covariance is None:
+        return _Answer(after)
+    error = estimate.pose.as_array() - sample.pose.as_array()
+    error[2] = wrap_angle(error[2])
+    if not np.isfinite(error).all():
+        return _Answer(after, distance=math.inf, angle=math.inf, sigmas=math.inf)
+    try:
+        squared = float(error @ np.linalg.solve(estimate.covariance, error))
+    except np.linalg.LinAlgError:
+        squared = math.nan
+    sigmas = math.sqrt(squared) if squared >= 0.0 else math.nan
+    return _Answer(after, False, math.hypot(error[0], error[1]), abs(float(error[2])), sigmas)
+
+
+def _count(fault: Fault, answers: Sequence[_Answer]) -> FaultRow:
+    given = [answer for answer in answers if answer.given]
+    after = [answer.right for answer in answers if answer.after]
+    return FaultRow(
+        fault,
+        frames=len(answers),
+        answered=len(given),
+        wrong=sum(answer.wrong for answer in answers),
+        refused=sum(answer.refused for answer in answers),
+        recovered=after.index(True) + 1 if any(after) else None,
+        worst_distance=max((answer.distance for answer in given), default=math.nan),
+        worst_angle=max((answer.angle for answer in given), default=math.nan),
+    )
+
+
+HEADER = ('fault', 'frames', 'answered', 'wrong', 'lost', 'refused', 'recovered after',
+          'worst mm', 'worst deg', 'what happens')
+
+
+def row_cells(row: FaultRow) -> list[str]:
+    """Give a row's text, in the order of the header."""
+    if row.fault.lasting:
+        recovered = '-'
+    else:
+        recovered = 'never' if row.recovered is None else str(row.recovered)
+    worst = ('-', '-') if not row.answered else (
+        f'{1e3 * row.worst_distance:.1f}', f'{math.degrees(row.worst_angle):.2f}')
+    counts = (row.frames, row.answered, row.wrong, row.lost, row.refused)
+    return [row.fault.name, *map(str, counts), recovered, *worst, row.fault.description]
+
+
+def fault_table(rows: Sequence[FaultRow]) -> str:
+    """Give the rows as a Markdown table."""
+    return table([list(HEADER), *(row_cells(row) for row in rows)])
+
+
+def fault_csv(rows: Sequence[FaultRow]) -> str:
+    """Give the rows as comma-separated values with a header, lengths in m, angles in rad."""
+    lines = ['fault,frames,answered,wrong,lost,refused,recovered_after,worst_m,worst_rad']
+    for row in rows:
+        recovered = '' if row.recovered is None else row.recovered
+        lines.append(
+            f'{row.fault.name},{row.frames},{row.answered},{row.wrong},{row.lost},{row.refused},'
+            f'{recovered},{row.worst_distance:.6f},{row.worst_angle:.6f}')
+    return '\n'.join(lines) + '\n'
