@@ -103,7 +103,7 @@ STATUSES = (
 CAUSES = (
     ('`image_data`', 'an image of unknown encoding, whose step, size and data do not fit, or '
      'that cannot be decoded'),
-    ('`image_size`, `image_type`', "an image that is not of the rig's size; no 8-bit colour image"),
+    ('`image_size`, `image_type`', "an image not of the rig's size; no 8-bit colour image"),
     ('`duplicate_stamp`, `out_of_order`',
      'an image with the stamp of the last one, or an earlier one'),
     ('`camera_info`', 'a camera_info that contradicts the rig'),

@@ -33,6 +33,7 @@ from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
+from nccs_pose.geometry.rig import Rig
 from nccs_pose.ros import diagnostics
 from nccs_pose.ros.camera_check import contradiction
 from nccs_pose.ros.conversions import read_initial_pose, read_odometry
@@ -74,6 +75,7 @@ class LocaliserNode(LifecycleNode):
         super().__init__('localiser', **node_arguments)
         answer_every_request(self)
         self._tally = diagnostics.Tally()
+        self._rig: Rig | None = None
         self._localiser: Localiser | None = None
         self._outputs: Outputs | None = None
         self._stream: ImageStream | None = None
@@ -160,7 +162,7 @@ class LocaliserNode(LifecycleNode):
         for name in ('rig_file', 'map_file'):
             if not getattr(self._options, name):
                 raise FrameRefusedError('configuration', f'parameter {name} is not set')
-        rig = load_rig(resolve(self._options.rig_file))
+        self._rig = rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
         self._localiser = Localiser(rig, line_map, estimator)
         self._outputs = Outputs(self, self._options, rig, line_map, self._tally.refuse)
@@ -222,12 +224,12 @@ class LocaliserNode(LifecycleNode):
             self._report_diagnostics()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        assert self._localiser is not None
+        assert self._rig is not None
         if self._options.camera_info_check == 'off':
             self._camera_problem = ''
             return
         words = contradiction(
-            message, self._localiser.rig.camera, self._options.camera_info_tolerance)
+            message, self._rig.camera, self._options.camera_info_tolerance)
         if words:
             self._refuse('camera_info', words)
         if words != self._camera_problem:
