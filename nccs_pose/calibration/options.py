@@ -37,11 +37,16 @@ class CalibrationOptions:
 
     rough_cop: float = option(
         3e-3, unit='m', low=1e-6, high=0.1, doc='Of the centre of projection.')
+    rough_cop_sideways: float = option(
+        5e-5, unit='m', low=1e-7, high=0.1,
+        doc='Of the centre of projection out of the plane x = 0 of the mirror frame. Small: the '
+        "mount's yaw is held, and with it base_link's heading; as large as rough_cop: the "
+        "camera's heading is.")
     rough_camera_tilt: float = option(
         0.035, unit='rad', low=1e-6, high=0.5, doc='Of the camera against the mirror.')
     rough_height: float = option(0.02, unit='m', low=1e-6, high=1.0, doc='Of the height.')
     rough_tilt: float = option(
-        0.005, unit='rad', low=1e-6, high=0.5, doc='Of the mirror against the robot.')
+        0.0175, unit='rad', low=1e-6, high=0.5, doc='Of the mirror against the robot.')
     rough_mirror: float = option(
         0.02, low=1e-6, high=0.5, doc="Of the mirror's shape, relative to its size.")
     rough_principal_point: float = option(

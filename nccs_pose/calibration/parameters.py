@@ -17,7 +17,11 @@
 The vector theta is the deviation from the rough rig, so that 'held by the rough value' is a
 prior theta ~ N(0, spread^2), number by number. The mounting's x, y and yaw are never free: a robot
 that moves in the plane cannot see where on it the mirror sits, only that base_link is there.
-Nor is the x of the centre of projection: it is 0 by the choice of the mirror frame.
+
+A rig file has its centre of projection at x = 0, by the choice of the mirror frame. Here it may
+leave that plane, as a camera that is pushed sideways does; :meth:`RigParameters.model` then turns
+the mirror frame about its axis until x is 0 again. Whether the camera was pushed sideways or turned
+about the axis the lines cannot tell: together they turn base_link.
 """
 
 from __future__ import annotations
@@ -108,14 +112,22 @@ class RigParameters:
                 fx=camera.fx * zoom, fy=camera.fy * zoom)
         mounting = rough.T_base_mirror
         tilt = rotation_exp([*self._part(theta, 'tilt_x', 'tilt_y'), 0.0])
+        azimuth = self._azimuth(theta)
+        cop = azimuth @ (rough.cop + self._part(theta, 'cop_x', 'cop_y', 'cop_z'))
+        cop[0] = 0.0  # but for rounding
         rig = Rig(
-            mirror, camera, rough.cop + [0.0, *self._part(theta, 'cop_y', 'cop_z')],
-            rotation_exp(self._part(theta, 'camera_x', 'camera_y', 'camera_z'))
+            mirror, camera, cop,
+            azimuth @ rotation_exp(self._part(theta, 'camera_x', 'camera_y', 'camera_z'))
             @ rough.R_mirror_camera,
             RigidTransform(
-                tilt @ mounting.rotation,
+                tilt @ mounting.rotation @ azimuth.T,
                 mounting.translation + [0.0, 0.0, self._part(theta, 'height')[0]]))
         return RigModel(rig, self._map(theta))
+
+    def _azimuth(self, theta: Array) -> Array:
+        """The turn (3, 3) about the mirror's axis that brings the centre of projection to x = 0."""
+        x, y, _ = self._bare.cop + self._part(theta, 'cop_x', 'cop_y', 'cop_z')
+        return rotation_exp([0.0, 0.0, np.arctan(x / y) if x != 0.0 and y != 0.0 else 0.0])
 
     def _map(self, theta: Array) -> LineMap:
         if not (self.lines or 'tape_width' in self.index):
@@ -139,13 +151,15 @@ class RigParameters:
         """
         s, camera = sensitivity, model.rig.camera
         # theta is a rotation vector: a step in it turns by its left Jacobian.
-        camera_turn = s.camera_rotation @ left_jacobian(
+        azimuth = self._azimuth(theta)
+        cop = s.cop @ azimuth
+        camera_turn = s.camera_rotation @ azimuth @ left_jacobian(
             self._part(theta, 'camera_x', 'camera_y', 'camera_z'))
         tilt = s.mounting_rotation @ left_jacobian(
             np.array([*self._part(theta, 'tilt_x', 'tilt_y'), 0.0]))
         zoom = 1.0 + self._part(theta, 'focal')[0]
         source: dict[str, Callable[[], Array]] = {
-            'cop_y': lambda: s.cop[:, 1], 'cop_z': lambda: s.cop[:, 2],
+            'cop_x': lambda: cop[:, 0], 'cop_y': lambda: cop[:, 1], 'cop_z': lambda: cop[:, 2],
             'camera_x': lambda: camera_turn[:, 0], 'camera_y': lambda: camera_turn[:, 1],
             'camera_z': lambda: camera_turn[:, 2],
             'height': lambda: s.mounting_translation[:, 2],
@@ -205,6 +219,8 @@ def _parameters(
 ) -> list[Parameter]:
     cop, camera = 'centre of projection', 'camera against mirror'
     out = [
+        Parameter('cop_x', 'centre of projection sideways (x)', 'm', options.rough_cop_sideways,
+                  cop),
         Parameter('cop_y', 'centre of projection across the axis (y)', 'm', options.rough_cop, cop),
         Parameter('cop_z', 'centre of projection along the axis (z)', 'm', options.rough_cop, cop)]
     out += [

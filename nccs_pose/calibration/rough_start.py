@@ -1,0 +1,156 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From a rough rig to a refined one: first poses, adjustment, and the poses again.
+
+Under a rough rig some frames begin at a wrong pose. They bend the rig a little, not beyond the
+others' agreement; under the refined rig they are posed again, and so on until nothing changes. If
+that ends badly, other rigs within the rough one's spread are tried as starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nccs_pose.calibration.adjustment import adjust, Adjustment
+from nccs_pose.calibration.first_poses import first_poses
+from nccs_pose.calibration.observations import FrameObservation, Observations
+from nccs_pose.calibration.parameters import RigParameters
+from nccs_pose.errors import CalibrationError, GeometryError
+from nccs_pose.geometry.pose import Array, wrap_angle
+
+_ROUNDS = 6
+_GOOD_FRAME = 0.85  # fraction of a frame's points that must be inliers
+_GOOD_SCALE = 3.0  # robust residual in units of the noise as told
+_GOOD_FRAMES = 0.7  # fraction of frames that must agree
+_START_FRAMES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A rig that explains the frames, or the best there was.
+
+    :ivar adjustment: over the frames that are used.
+    :ivar used: indices of those frames.
+    :ivar agreement: fraction of all frames that the rig explains.
+    :ivar settled: whether rig and poses agree well enough to be believed.
+    """
+
+    adjustment: Adjustment
+    used: NDArray[np.intp]
+    agreement: float
+
+    @property
+    def settled(self) -> bool:
+        """Whether the adjustment converged and explains most frames at about the noise told."""
+        return (self.adjustment.converged and self.adjustment.scale <= _GOOD_SCALE
+                and self.agreement >= _GOOD_FRAMES)
+
+    @property
+    def merit(self) -> float:
+        """The larger, the better."""
+        return self.agreement / self.adjustment.scale
+
+
+def start(
+    parameters: RigParameters, frames: list[FrameObservation], poses: Array | None = None,
+) -> Start:
+    """Refine a rough rig from frames of known labels.
+
+    :param poses: T_map_base of every frame (F, 3) where something knows them, NaN where not.
+    :raises CalibrationError: if no frame has a pose, or nothing fits.
+    """
+    few = frames
+    if poses is None and len(frames) > _START_FRAMES:
+        few = [frames[i] for i in
+               np.linspace(0, len(frames) - 1, _START_FRAMES).round().astype(int)]
+        poses_few = None
+    else:
+        poses_few = poses
+    best, failure = None, None
+    for theta in _starts(parameters):
+        try:
+            found = _settle(parameters, few, theta, poses_few)
+        except (CalibrationError, GeometryError) as error:
+            failure = failure or error
+            continue
+        if best is None or found.merit > best.merit:
+            best = found
+        if best.settled:
+            break
+    if best is None:
+        raise failure or CalibrationError('no frame has a pose under the rough rig')
+    if few is not frames and best.settled:
+        return _settle(parameters, frames, best.adjustment.theta, None)
+    return best
+
+
+def _starts(parameters: RigParameters) -> Iterator[Array]:
+    """The rough rig, then rigs in its neighbourhood."""
+    yield np.zeros(len(parameters))
+    for name in ('cop_y', 'cop_z', 'camera_x', 'camera_y'):
+        for sign in (1.0, -1.0):
+            theta = np.zeros(len(parameters))
+            theta[parameters.index[name]] = 0.6 * sign * parameters.spread[parameters.index[name]]
+            yield theta
+
+
+def _settle(
+    parameters: RigParameters, frames: list[FrameObservation], theta: Array,
+    poses: Array | None,
+) -> Start:
+    """Alternate adjustment and new poses for the frames that disagree."""
+    model = parameters.model(theta)
+    poses = np.full((len(frames), 3), np.nan) if poses is None else poses.copy()
+    lost = np.flatnonzero(np.isnan(poses[:, 0]))
+    poses[lost] = first_poses(model.rig, model.line_map, [frames[i] for i in lost])[0]
+    result, agreement, used = None, 0.0, np.empty(0, dtype=np.intp)
+    for _ in range(_ROUNDS):
+        used = np.flatnonzero(np.isfinite(poses[:, 0]))
+        if len(used) < 2:
+            raise CalibrationError(
+                f'{len(used)} of {len(frames)} frames have a pose under the rough rig: wrong '
+                'map, wrong kind of mirror, or a rough rig too far off')
+        observations = Observations.stack([frames[i] for i in used], parameters.rough.line_map)
+        result = adjust(parameters, observations, poses[used], theta=theta)
+        theta, poses[used] = result.theta, result.poses
+        good = np.zeros(len(frames), dtype=bool)
+        good[used] = [result.inlier[rows].mean() >= _GOOD_FRAME for rows in observations.slices()]
+        agreement = float(good.mean())
+        bad = np.flatnonzero(~good)
+        if not len(bad):
+            break
+        again = first_poses(
+            result.model.rig, result.model.line_map, [frames[i] for i in bad])[0]
+        if not _moved(poses[bad], again).any():
+            break
+        poses[bad] = again
+    assert result is not None
+    kept = np.flatnonzero(good[used])
+    if 2 <= len(kept) < len(used):
+        # Frames that never agreed, e.g. with a wrong label, have no say in the end.
+        result = adjust(parameters, observations.chosen(kept), poses[used[kept]], theta=theta)
+        used = used[kept]
+    return Start(result, used, agreement)
+
+
+def _moved(before: Array, after: Array) -> NDArray[np.bool_]:
+    """Which poses (F, 3) changed by more than a few centimetres or degrees."""
+    change = after - before
+    change[:, 2] = wrap_angle(change[:, 2])
+    return ~(np.abs(change) < [0.03, 0.03, 0.03]).all(axis=1)
