@@ -132,8 +132,6 @@ def _answer(localiser: Answering, sample: ImageSample, after: bool) -> _Answer:
         return _Answer(after)
     error = estimate.pose.as_array() - sample.pose.as_array()
     error[2] = wrap_angle(error[2])
-    if not np.isfinite(error).all():
-        return _Answer(after, distance=math.inf, angle=math.inf, sigmas=math.inf)
     try:
         squared = float(error @ np.linalg.solve(estimate.covariance, error))
     except np.linalg.LinAlgError:

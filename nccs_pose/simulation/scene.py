@@ -230,7 +230,7 @@ def arena_scene(width: int = 1280) -> Scene:
         ),
     )
     sensor = SensorModel(
-        exposure=1.25,
+        exposure=0.8,
         white_balance=(0.94, 1.0, 1.05),
         vignetting=0.25,
         psf_sigma=0.5 * math.sqrt(width / 1280),
