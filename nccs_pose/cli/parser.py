@@ -41,7 +41,6 @@ class Command:
         return import_module(self.module)
 
 
-_FORMAT = argparse.RawDescriptionHelpFormatter  # keeps examples on their own lines
 _ROOM = '--rig config/room_rig.yaml --map config/room_map.yaml'
 COMMANDS = (
     Command('replay', 'nccs_pose.cli.replay',
@@ -97,17 +96,20 @@ def parse(argv: Sequence[str]) -> Call:
     """
     chosen = find_command(argv)
     parser = argparse.ArgumentParser(
-        prog='nccs-pose',
-        description='Planar localisation from the floor lines that a catadioptric camera sees.',
+        prog='nccs-pose', usage='nccs-pose COMMAND ...',
+        description='Planar localisation from the floor lines that a catadioptric camera sees.\n\n'
+                    'commands:\n' + '\n'.join(f'  {c.name:12}{c.summary}' for c in COMMANDS),
         epilog=f'example: {COMMANDS[0].example}\n\n'
                'Every command explains itself with --help. Exit codes: 0 ok, 1 the result is bad, '
                '2 wrong usage or input.',
-        formatter_class=_FORMAT)
-    words = parser.add_subparsers(dest='command', metavar='COMMAND', title='commands')
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    words = parser.add_subparsers(dest='command', metavar='COMMAND', help=argparse.SUPPRESS)
     for command in COMMANDS:
         word = words.add_parser(
-            command.name, help=command.summary, description=f'{command.summary.capitalize()}.',
-            epilog=f'example: {command.example}', formatter_class=_FORMAT)
+            command.name, prog=f'nccs-pose {command.name}',
+            description=f'{command.summary[0].upper()}{command.summary[1:]}.',
+            epilog=f'example: {command.example}',
+            formatter_class=argparse.RawDescriptionHelpFormatter)
         if command is chosen:
             command.load().add_arguments(word)
     arguments = parser.parse_args(argv)

@@ -177,7 +177,7 @@ def _list(values: object) -> str:
 
 def _rows(matrix: np.ndarray) -> str:
     rows = [', '.join(_number(value) for value in row) for row in np.asarray(matrix, dtype=float)]
-    return '[' + ',\n    '.join(rows) + ']'
+    return '[\n    ' + ',\n    '.join(rows) + ']'
 
 
 def _quoted(text: str) -> str:

@@ -1,0 +1,300 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The command line: what it writes, what it says, and the exit codes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import io
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import cv2
+from nccs_pose.cli import main
+from nccs_pose.cli.parser import COMMANDS
+from nccs_pose.cli.progress import Progress
+from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.bags import BagReader, BagWriter
+from nccs_pose.files.trajectories import read_tum, write_tum
+from nccs_pose.geometry.pose import Pose2
+import numpy as np
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+ROOM = ['--rig', str(REPO / 'config/room_rig.yaml'), '--map', str(REPO / 'config/room_map.yaml')]
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope='module')
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small simulated drive: a bag, its rig and its map."""
+    bag = tmp_path_factory.mktemp('drive') / 'eight'
+    assert main(['render', str(bag), '--frames', '5', '--width', '640', '--scene', 'ideal']) == 0
+    return bag
+
+
+def calibrated(bag: Path) -> list[str]:
+    return ['--rig', f'{bag}_rig.yaml', '--map', f'{bag}_map.yaml']
+
+
+@pytest.fixture(scope='module')
+def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped bag replayed once, with pictures."""
+    folder = tmp_path_factory.mktemp('room')
+    code = main(['replay', str(REPO / 'bags/room'), *ROOM, '--output', str(folder / 'poses.tum'),
+                 '--plots', str(folder), '--overlays', '3'])
+    assert code == 0
+    return folder
+
+
+def said(capsys: Capture, arguments: list[str]) -> tuple[int, str, str]:
+    code = main(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def refusal(capsys: Capture, arguments: list[str]) -> str:
+    """The one sentence on stderr of a call that must end with exit code 2."""
+    code, _, err = said(capsys, arguments)
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    assert err.startswith(f'nccs-pose {arguments[0]}: ')
+    return err
+
+
+def test_the_shipped_bag_is_answered_and_right(room_run: Path, ray_traced: Path) -> None:
+    """Judged by the sequence's own ground-truth file, not by the bag or the tool."""
+    poses, truth = read_tum(room_run / 'poses.tum'), read_tum(
+        ray_traced / 'dev_room' / 'groundtruth.tum')
+    true = {int(s): p for s, p in zip(truth.stamps_ns, truth.poses)}
+    errors = np.array([p - true[int(s)] for s, p in zip(poses.stamps_ns, poses.poses)])
+    translation = np.hypot(errors[:, 0], errors[:, 1])
+    yaw = np.degrees(np.abs(np.angle(np.exp(1j * errors[:, 2]))))
+    assert np.count_nonzero((translation < 0.05) & (yaw < 1.0)) >= 0.9 * len(truth)
+    numbers = json.loads((room_run / 'poses.evaluation.json').read_text())
+    assert numbers['frames'] == 60
+    assert numbers['answered'] == len(poses)
+    assert numbers['translation_m']['rmse'] == pytest.approx(
+        np.sqrt(np.mean(translation**2)), rel=1e-4)
+    assert numbers['yaw_rad']['max'] == pytest.approx(np.radians(yaw.max()), rel=1e-4)
+
+
+def test_replay_leaves_records_configuration_and_pictures(room_run: Path) -> None:
+    rows = [json.loads(line) for line in (room_run / 'poses.frames.jsonl').open()]
+    assert [row['index'] for row in rows] == list(range(60))
+    poses = read_tum(room_run / 'poses.tum')
+    answered = [row for row in rows if 'pose_x_y_yaw' in row]
+    assert [row['stamp_ns'] for row in answered] == poses.stamps_ns.tolist()
+    for row in answered:
+        assert row['state'] and row['reason']
+        assert np.linalg.eigvalsh(np.array(row['covariance'])).min() > 0.0
+    used = json.loads((room_run / 'poses.run.json').read_text())
+    assert used['rig']['text'] == (REPO / 'config/room_rig.yaml').read_text()
+    assert used['topics']['image'] == '/camera/image_raw/compressed'
+    assert used['options']
+    pictures = sorted(path.name for path in room_run.glob('*.*g'))
+    assert pictures == ['errors.png', 'histogram.png', 'overlay_0000.jpg', 'overlay_0030.jpg',
+                        'overlay_0059.jpg', 'trajectory.png']
+    for name in pictures:
+        assert min(cv2.imread(str(room_run / name)).shape[:2]) > 300
+
+
+def test_replaying_twice_gives_the_same_bytes(drive: Path, tmp_path: Path) -> None:
+    contents = []
+    for run in ('first', 'second'):
+        folder = tmp_path / run
+        assert main(['replay', str(drive), *calibrated(drive), '--plots', str(folder),
+                     '--output', str(folder / 'poses.tum')]) == 0
+        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert len(contents[0]) >= 8
+    assert contents[0] == contents[1]
+
+
+def test_rendering_twice_gives_the_same_bag(drive: Path, tmp_path: Path) -> None:
+    again = tmp_path / 'eight'
+    main(['render', str(again), '--frames', '5', '--width', '640', '--scene', 'ideal'])
+    for name in ('eight.mcap', 'metadata.yaml'):
+        assert (again / name).read_bytes() == (drive / name).read_bytes()
+    with BagReader(drive) as bag:
+        assert bag.image_count() == 5
+        assert len(bag.ground_truth()) == 5
+        assert len(bag.odometry()) >= 9
+        assert bag.camera().width == 640
+
+
+def test_render_takes_another_rig_and_map(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag'
+    assert main(['render', str(bag), '--frames', '1', '--compression', 'none', *ROOM]) == 0
+    with BagReader(bag) as reader:
+        assert reader.topics.image == '/camera/image_raw'
+        assert reader.camera().width == 960
+        assert next(reader.events(odometry=False)).decode().shape == (720, 960, 3)
+
+
+def black_bag(path: Path, size: tuple[int, int] = (720, 960)) -> Path:
+    with BagWriter(path) as writer:
+        for i in range(3):
+            writer.write_image(10**9 * (1 + i), np.zeros((*size, 3), np.uint8), compression='png')
+            writer.write_odometry(10**9 * (1 + i), Pose2(0.1 * i, 0.0, 0.0))
+    return path
+
+
+def test_a_bag_in_which_no_frame_is_answered_ends_with_1(tmp_path: Path, capsys: Capture) -> None:
+    bag = black_bag(tmp_path / 'bag')
+    code, out, _ = said(
+        capsys, ['replay', str(bag), *ROOM, '--output', str(tmp_path / 'poses.tum')])
+    assert code == 1
+    assert len(read_tum(tmp_path / 'poses.tum')) == 0
+    rows = [json.loads(line) for line in (tmp_path / 'poses.frames.jsonl').open()]
+    assert len(rows) == 3
+    assert all(row['reason'] for row in rows)
+    assert 'tracking' not in out
+
+
+def test_images_of_another_size_are_refused_one_by_one(tmp_path: Path, capsys: Capture) -> None:
+    bag = black_bag(tmp_path / 'bag', (48, 64))
+    code, out, _ = said(
+        capsys, ['replay', str(bag), *ROOM, '--output', str(tmp_path / 'poses.tum')])
+    assert code == 1
+    assert '3 refused' in out
+    assert 'image_size' in out and '64' in out and '960' in out
+
+
+def test_a_bag_of_another_camera_is_refused(drive: Path, tmp_path: Path, capsys: Capture) -> None:
+    message = refusal(
+        capsys, ['replay', str(drive), *ROOM, '--output', str(tmp_path / 'poses.tum')])
+    assert '640 x 480' in message and '960 x 720' in message
+    assert not (tmp_path / 'poses.tum').exists()
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    (lambda a: [*a, '--option', 'nonsense=1'], ['nonsense', 'there are']),
+    (lambda a: [*a, '--image-topic', '/odom'], ['/odom', 'nav_msgs/msg/Odometry']),
+    (lambda a: [*a, '--map', 'absent.yaml'], ['absent.yaml']),
+    (lambda a: [*a, '--map', f'{a[1]}_rig.yaml'], ['_rig.yaml', 'lines', 'missing']),
+    (lambda a: ['replay', 'absent', *a[2:]], ['absent', 'no such bag']),
+])
+def test_wrong_input_ends_in_one_sentence(
+    drive: Path, tmp_path: Path, capsys: Capture,
+    change: Callable[[list[str]], list[str]], words: list[str],
+) -> None:
+    arguments = ['replay', str(drive), *calibrated(drive), '--output', str(tmp_path / 'p.tum')]
+    message = refusal(capsys, change(arguments))
+    for word in words:
+        assert word in message
+
+
+def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture) -> None:
+    stamps = 10**18 + np.arange(20) * 10**8
+    poses = np.column_stack([np.arange(20), np.zeros(20), np.linspace(-3, 3, 20)])
+    write_tum(Trajectory(stamps, poses), tmp_path / 'truth.tum')
+    write_tum(Trajectory(stamps[::2], poses[::2] + np.array([0.006, 0.008, 0.0])),
+              tmp_path / 'poses.tum')
+    call = ['evaluate', str(tmp_path / 'poses.tum'), str(tmp_path / 'truth.tum')]
+    code, out, _ = said(capsys, [
+        *call, '--frames', '12', '--output', str(tmp_path / 'n.json'),
+        '--plots', str(tmp_path / 'plots'), '--map', ROOM[3]])
+    assert code == 0
+    assert '10 of 12 frames answered' in out
+    assert '10.00' in out
+    assert json.loads((tmp_path / 'n.json').read_text())['translation_m']['median'] == (
+        pytest.approx(0.01))
+    assert len(list((tmp_path / 'plots').iterdir())) == 3
+    assert said(capsys, [*call, '--output', str(tmp_path / 'n.md')])[0] == 0
+    assert (tmp_path / 'n.md').read_text() == said(capsys, call)[1]
+    assert '.json or .md' in refusal(capsys, [*call, '--output', str(tmp_path / 'n.txt')])
+    assert 'more poses, 10' in refusal(capsys, [*call, '--frames', '3'])
+
+
+def test_trajectories_without_common_time_end_with_1(tmp_path: Path, capsys: Capture) -> None:
+    for name, start in (('a', 0), ('b', 10**12)):
+        write_tum(Trajectory(start + np.arange(3), np.zeros((3, 3))), tmp_path / f'{name}.tum')
+    code, out, _ = said(capsys, ['evaluate', str(tmp_path / 'a.tum'), str(tmp_path / 'b.tum')])
+    assert code == 1
+    assert '0 compared' in out
+
+
+def test_help_is_complete_and_explains_every_command(capsys: Capture) -> None:
+    code, out, _ = said(capsys, ['--help'])
+    assert code == 0
+    for command in COMMANDS:
+        assert f'  {command.name} ' in out
+        code, text, _ = said(capsys, [command.name, '--help'])
+        assert code == 0
+        assert command.example in text
+        assert text.startswith(f'usage: nccs-pose {command.name} ')
+
+
+@pytest.mark.parametrize('arguments', [[], ['fly'], ['replay'], ['replay', '--nonsense']])
+def test_wrong_usage_ends_with_2(arguments: list[str], capsys: Capture) -> None:
+    code, _, err = said(capsys, arguments)
+    assert code == 2
+    assert 'usage' in err
+
+
+def test_help_loads_neither_numpy_nor_opencv() -> None:
+    """So that it is quick on a small robot's computer."""
+    code = ('import sys; from nccs_pose.cli import main; main(["--help"]); '
+            'print(sorted({"numpy", "cv2", "rosbags", "matplotlib"} & set(sys.modules)))')
+    run = subprocess.run(
+        [sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-1] == '[]'
+
+
+def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def interrupted(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('nccs_pose.cli.evaluate.run', interrupted)
+    code, _, err = said(capsys, ['evaluate', 'a.tum', 'b.tum'])
+    assert code == 130
+    assert 'interrupted' in err
+
+
+def test_a_closed_pipe_is_no_traceback(tmp_path: Path) -> None:
+    write_tum(Trajectory([0], np.zeros((1, 3))), tmp_path / 'a.tum')
+    line = f'{sys.executable} -m nccs_pose.cli evaluate {tmp_path}/a.tum {tmp_path}/a.tum'
+    run = subprocess.run(
+        ['bash', '-c', f'{line} | true'], cwd=REPO, capture_output=True, text=True)
+    assert 'Traceback' not in run.stderr
+    assert 'Exception' not in run.stderr
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_moves_on_a_terminal_and_is_silent_when_short(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr('nccs_pose.cli.progress.time.monotonic', lambda: now[0])
+
+    def run(stream: io.StringIO, seconds: float) -> str:
+        with Progress(10, 'frames', stream) as progress:
+            for _ in range(10):
+                now[0] += seconds
+                progress.step('tracking')
+        return stream.getvalue()
+
+    assert run(io.StringIO(), 0.1) == ''
+    lines = run(io.StringIO(), 3.0).splitlines()
+    assert lines[0] == '2/10 frames, 24 s to go  tracking'
+    assert len(lines) == 5
+    moving = run(Terminal(), 0.2)
+    assert moving.count('\r') == 12 and '\n' not in moving
+    assert moving.endswith('\r')
