@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -24,8 +25,11 @@ import sys
 
 import cv2
 from nccs_pose.cli import main
+from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.parser import COMMANDS
 from nccs_pose.cli.progress import Progress
+from nccs_pose.errors import FileError
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagWriter
 from nccs_pose.files.trajectories import read_tum, write_tum
@@ -182,6 +186,8 @@ def test_a_bag_of_another_camera_is_refused(drive: Path, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(('change', 'words'), [
     (lambda a: [*a, '--option', 'nonsense=1'], ['nonsense', 'there are']),
+    (lambda a: [*a, '--option', 'method=guess'], ['method', 'guess', 'paper']),
+    (lambda a: [*a, '--output', str(REPO)], [str(REPO), 'folder']),
     (lambda a: [*a, '--image-topic', '/odom'], ['/odom', 'nav_msgs/msg/Odometry']),
     (lambda a: [*a, '--map', 'absent.yaml'], ['absent.yaml']),
     (lambda a: [*a, '--map', f'{a[1]}_rig.yaml'], ['_rig.yaml', 'lines', 'missing']),
@@ -195,6 +201,39 @@ def test_wrong_input_ends_in_one_sentence(
     message = refusal(capsys, change(arguments))
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize('name', ['arena.yaml', 'robot.yaml', 'room.yaml'])
+def test_the_node_s_parameter_files_configure_a_replay(name: str) -> None:
+    assert make_options(None, REPO / 'config' / name, []) == LocaliserOptions()
+
+
+def test_options_come_from_file_setting_and_method_in_this_order(tmp_path: Path) -> None:
+    number = next(f for f in dataclasses.fields(LocaliserOptions)
+                  if isinstance(f.default, float) and f.metadata['low'] is not None)
+    low = number.metadata['low']
+    path = tmp_path / 'params.yaml'
+    path.write_text(f"""
+/**:
+  ros__parameters: {{method: paper}}
+/robot/localiser:
+  ros__parameters: {{{number.name}: {low}, rig_file: x.yaml, use_sim_time: true}}
+talker:
+  ros__parameters: {{nonsense: 1}}
+""")
+    options = make_options(None, path, [])
+    assert (options.method, getattr(options, number.name)) == ('paper', low)
+    given = make_options('nccs', path, [f'{number.name}={number.default}', 'method=paper'])
+    assert given == LocaliserOptions()
+    path.write_text(path.read_text().replace('rig_file', 'rig_fil'))
+    with pytest.raises(FileError, match=r'params\.yaml: rig_fil '):
+        make_options(None, path, [])
+    path.write_text(f'localiser: {{ros__parameters: {{{number.name}: {low - 1}}}}}')
+    with pytest.raises(FileError, match=rf'params\.yaml: {number.name} = '):
+        make_options(None, path, [])
+    path.write_text('talker: {ros__parameters: {}}')
+    with pytest.raises(FileError, match=r'params\.yaml: localiser is missing'):
+        make_options(None, path, [])
 
 
 def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture) -> None:

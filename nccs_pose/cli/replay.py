@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable
 import dataclasses
 import json
 from pathlib import Path
 import sys
 from typing import Any
 
+from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.offline_run import (
     answered_poses,
     FrameRecord,
@@ -46,7 +46,7 @@ from nccs_pose.evaluation.tables import as_numbers, consistency_table, summary_t
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagTopics
 from nccs_pose.files.pictures import save_figure, save_image
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.trajectories import write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.camera import PinholeCamera
@@ -71,8 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--overlays', type=int, default=6, metavar='N',
         help='images to draw detections and prediction on, with --plots (default %(default)s)')
     parser.add_argument(
-        '--method', choices=('nccs', 'paper'), default='nccs',
-        help="nccs: this project's estimator; paper: the published one (default %(default)s)")
+        '--method', choices=('nccs', 'paper'),
+        help="nccs: this project's estimator (default); paper: the published one")
+    parser.add_argument(
+        '--params', type=Path, metavar='FILE',
+        help='ROS parameter file of the node, for the options of its localiser')
     parser.add_argument(
         '--option', action='append', default=[], metavar='NAME=VALUE',
         help='set an option of the localiser; may be given again')
@@ -85,7 +88,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
-    options = make_options(args.method, args.option)
+    options = make_options(args.method, args.params, args.option)
+    check_writable(args.output)
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:
@@ -114,38 +118,14 @@ def run(args: argparse.Namespace) -> int:
     return 0 if len(estimated) else 1
 
 
-def make_options(method: str, settings: Iterable[str]) -> LocaliserOptions:
-    """Options of the localiser from `--method` and `--option NAME=VALUE`.
-
-    :raises FileError: if an option is not known or its value is of another type.
-    """
-    fields = {field.name: field for field in dataclasses.fields(LocaliserOptions)}
-    values: dict[str, Any] = {'method': method}
-    for setting in settings:
-        name, _, text = setting.partition('=')
-        if name not in fields:
-            raise FileError(
-                f'--option {setting}: there is no option {name!r}; there are '
-                f'{", ".join(fields)}.')
-        values[name] = _parse_value(setting, text, fields[name].default)
-    return LocaliserOptions(**values)
-
-
-def _parse_value(setting: str, text: str, default: Any) -> Any:
-    kind = type(default)
-    if kind is bool:
-        if text.lower() not in ('true', 'false'):
-            raise FileError(f'--option {setting}: must be true or false.')
-        return text.lower() == 'true'
-    try:
-        return kind(text)
-    except ValueError as error:
-        raise FileError(f'--option {setting}: must be a {kind.__name__}.') from error
-
-
 def _check_camera(bag: BagReader, rig: Rig, path: Path) -> None:
     """Hold the bag's CameraInfo against the rig; the rig counts, but a difference is said."""
-    recorded, camera = bag.camera(), rig.camera
+    camera = rig.camera
+    try:
+        recorded = bag.camera()
+    except FileError as error:
+        print(f'nccs-pose replay: warning: {error}', file=sys.stderr)
+        return
     if recorded is None:
         return
     if (recorded.width, recorded.height) != (camera.width, camera.height):

@@ -44,3 +44,19 @@ def write_text(path: str | Path, text: str) -> None:
             with suppress(OSError):
                 temporary.unlink()
         raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
+
+
+def check_writable(path: str | Path) -> None:
+    """Refuse a path that :func:`write_text` could not write, before long work and not after it.
+
+    :raises FileError: if it is a folder, or its own folder cannot be made or written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise FileError(f'{path}: cannot be written: it is a folder.')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
+    if not os.access(path.parent, os.W_OK):
+        raise FileError(f'{path}: cannot be written: its folder is read-only.')

@@ -129,6 +129,13 @@ class Section:
         where = self.key(key) if key else self.path
         return FileError(f'{self.source}: {where}{" " if where else ""}{reason}.')
 
+    def names(self) -> list[str]:
+        return list(self._content)
+
+    def content(self) -> dict[str, Any]:
+        """All of it as plain values, unchecked."""
+        return dict(self._content)
+
     def value(self, key: str, default: Any = _REQUIRED, accepted: str = 'a value') -> Any:
         self._known.append(key)
         if key in self._content:
