@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
             trajectory_figure,
         )
 
-        lines = load_map(args.map) if args.map else ()
+        lines = tuple(load_map(args.map)) if args.map else ()
         figures = {
             'trajectory': trajectory_figure(estimated, truth, lines, args.estimated.name),
             'errors': error_figure(errors, title=args.estimated.name),

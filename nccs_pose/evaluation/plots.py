@@ -18,6 +18,7 @@ Matplotlib's object interface with the Agg canvas: no window, no global state, t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 
 from matplotlib.axes import Axes
@@ -25,7 +26,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from nccs_pose.evaluation.metrics import PoseErrors
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.pose import Array
 import numpy as np
 
@@ -37,12 +38,12 @@ _LINE_COLOURS = {'green': '#2e9e44', 'white': '#b0b0b0', 'yellow': '#d4b400', 'r
 
 
 def trajectory_figure(
-    estimated: Trajectory, truth: Trajectory | None, line_map: LineMap, title: str = '',
+    estimated: Trajectory, truth: Trajectory | None, lines: Iterable[Line], title: str = '',
 ) -> Figure:
-    """Draw the estimated poses over the true path, among the map's lines."""
+    """Draw the estimated poses over the true path, among the lines (a map is one)."""
     figure = _figure(7.5, 7.0)
     axes = figure.add_subplot()
-    for line in line_map:
+    for line in lines:
         (x0, y0), (x1, y1) = line.start[:2], line.end[:2]
         colour = _LINE_COLOURS.get(line.colour, '#2e9e44')
         axes.plot([x0, x1], [y0, y1], color=colour, linewidth=5, alpha=0.55,

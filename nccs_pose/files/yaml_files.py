@@ -147,16 +147,19 @@ def _camera(section: Section) -> PinholeCamera:
 
 def _line(section: Section, width: float, colour: str, default_name: str) -> Line:
     name = section.text('name', default_name)
-    ends = []
-    for key in ('start', 'end'):
-        point = section.numbers(key, (2, 3), unit='m')
-        ends.append(point if point.size == 3 else np.append(point, 0.0))
+    start, end = _point(section, 'start'), _point(section, 'end')
     width = section.number('width', width, unit='m', low=0.0)
     colour = section.text('colour', colour)
     section.done()
-    if np.array_equal(*ends):
-        raise section.error('', f'(line {name!r}) has no length: start and end are {ends[0]}')
-    return _build(section, '', lambda: Line(*ends, width=width, colour=colour, name=name))
+    if np.array_equal(start, end):
+        raise section.error('', f'(line {name!r}) has no length: start and end are {start}')
+    return _build(section, '', lambda: Line(start, end, width, colour, name))
+
+
+def _point(section: Section, key: str) -> np.ndarray:
+    """Two numbers, on the ground, or three."""
+    point = section.numbers(key, (2, 3), unit='m')
+    return point if point.size == 3 else np.append(point, 0.0)
 
 
 def _build(section: Section, key: str, make: Callable[[], _Value]) -> _Value:

@@ -128,7 +128,7 @@ def decode_compressed(image_format: str, data: Any) -> Image:
         raise VisionError(f'{kind} image cannot be decoded: {error.err}') from error
     if image is None or image.shape[:2] != (height, width):
         raise VisionError(f'{kind} image of {len(content)} bytes cannot be decoded')
-    return image
+    return np.asarray(image, np.uint8)
 
 
 def _rows(encoding: str, height: int, row_bytes: int, step: int, data: Any) -> Image:
@@ -152,7 +152,7 @@ def _contiguous(pixels: NDArray[np.uint8]) -> Image:
 
 def _convert(pixels: Image, code: int, encoding: str) -> Image:
     try:
-        return cv2.cvtColor(pixels, code)
+        return np.asarray(cv2.cvtColor(pixels, code), np.uint8)
     except cv2.error as error:  # e.g. a Bayer image of one row
         height, width = pixels.shape[:2]
         raise VisionError(
