@@ -31,6 +31,8 @@ from nccs_pose.simulation.textures import (
 )
 import numpy as np
 
+_PIECE = 1 << 14
+
 
 def render(
     scene: Scene, pose: Pose2, rng: np.random.Generator, twist: Twist | None = None
@@ -73,8 +75,9 @@ def paint(scene: Scene, pose: Pose2) -> np.ndarray:
     view, look = floor_view(scene.rig), scene.appearance
     colours = np.empty((len(view.pixel), 3), np.float32)
     colours[:] = look.background
-    _paint_floor(colours, view, look, pose)
-    _paint_tapes(colours, view, scene, pose)
+    light = _light(view, look, pose)
+    _paint_floor(colours, view, look, pose, light)
+    _paint_tapes(colours, view, scene, pose, light)
     if look.room is not None:
         _paint_room(colours, view, look.room, pose)
     for obstacle in look.obstacles:
@@ -89,55 +92,77 @@ def paint(scene: Scene, pose: Pose2) -> np.ndarray:
     return image.reshape(view.height, view.width, 3)
 
 
-def _paint_floor(colours: np.ndarray, view: FloorView, look: Appearance, pose: Pose2) -> None:
-    floor = colours[: len(view.floor)]
-    if look.texture is None and look.light_gradient == (0.0, 0.0):
-        floor[:] = look.floor_colour
-        return
+def _floor_on_map(view: FloorView, pose: Pose2) -> np.ndarray:
+    """Give the map's x and y (2, F) float32 of the floor that each pixel sees."""
     rotation = pose.rotation[:2, :2].astype(np.float32)
-    x, y = rotation @ view.floor.T + pose.translation[:2, None].astype(np.float32)
-    light = 1.0 + np.float32(look.light_gradient[0]) * x + np.float32(look.light_gradient[1]) * y
-    np.clip(light, 0.3, 1.7, out=light)
+    return rotation @ view.floor.T + pose.translation[:2, None].astype(np.float32)
+
+
+def _light(view: FloorView, look: Appearance, pose: Pose2) -> np.ndarray:
+    """Give the light on the floor of each pixel (F,) float32, 1 at the map's origin."""
+    if look.light_gradient == (0.0, 0.0):
+        return np.ones(len(view.floor), np.float32)
+    x, y = _floor_on_map(view, pose)
+    along_x, along_y = (np.float32(gradient) for gradient in look.light_gradient)
+    return np.clip(1.0 + along_x * x + along_y * y, 0.3, 1.7)
+
+
+def _paint_floor(
+    colours: np.ndarray, view: FloorView, look: Appearance, pose: Pose2, light: np.ndarray
+) -> None:
     if look.texture is not None:
         level = floor_level(look.texture, view.footprint)
-        light *= floor_brightness(look.texture, x, y, level)
+        light = light * floor_brightness(look.texture, *_floor_on_map(view, pose), level)
+    floor = colours[: len(view.floor)]
     np.multiply(light[:, None], np.array(look.floor_colour, np.float32), out=floor)
 
 
-def _paint_tapes(colours: np.ndarray, view: FloorView, scene: Scene, pose: Pose2) -> None:
-    """Lay the tapes, then the patches, one over the other; the light falls on them as well."""
+def _paint_tapes(
+    colours: np.ndarray, view: FloorView, scene: Scene, pose: Pose2, light: np.ndarray
+) -> None:
+    """Lay the tapes, then the patches, one over the other."""
     look, to_base = scene.appearance, pose.inverse()
     for tape in (*scene.line_map, *look.patches):
         index, coverage = tape_coverage(view, tape.transformed(to_base))
         share = coverage.astype(np.float32)[:, None]
-        paint_ = np.array(look.line_colours[tape.colour], np.float32)
-        colours[index] = (1.0 - share) * colours[index] + share * paint_
+        colour = np.array(look.line_colours[tape.colour], np.float32) * light[index, None]
+        colours[index] = (1.0 - share) * colours[index] + share * colour
 
 
 def _paint_room(colours: np.ndarray, view: FloorView, room: Room, pose: Pose2) -> None:
     """Put walls and ceiling in front of whatever the rays would meet behind them."""
+    floor = _floor_on_map(view, pose)
+    behind = ((floor[0] < room.x_min) | (floor[0] > room.x_max)
+              | (floor[1] < room.y_min) | (floor[1] > room.y_max))
+    index = np.r_[np.flatnonzero(behind), np.arange(len(view.floor), len(view.pixel))]
+    # In pieces that the processor's cache holds.
+    for first in range(0, len(index), _PIECE):
+        piece = index[first : first + _PIECE]
+        colours[piece] = _room_colours(
+            view.origin[:, piece], view.direction[:, piece], room, pose)
+
+
+def _room_colours(
+    origin: np.ndarray, direction: np.ndarray, room: Room, pose: Pose2
+) -> np.ndarray:
+    """Give what rays (3, N) of base_link meet on the walls or the ceiling, (N, 3)."""
     rotation = pose.rotation[:2, :2].astype(np.float32)
-    shift = pose.translation[:2, None].astype(np.float32)
     low = np.array([[room.x_min], [room.y_min]], np.float32)
     high = np.array([[room.x_max], [room.y_max]], np.float32)
-    floor = rotation @ view.floor.T + shift
-    behind = np.any((floor < low) | (floor > high), axis=0)
-    index = np.r_[np.flatnonzero(behind), np.arange(len(view.floor), len(view.pixel))]
-    origin = rotation @ view.origin[:2, index] + shift
-    across = rotation @ view.direction[:2, index]
+    start = rotation @ origin[:2] + pose.translation[:2, None].astype(np.float32)
+    across = rotation @ direction[:2]
     across[np.abs(across) < 1e-6] = 1e-6
-    ranges = (np.where(across > 0.0, high, low) - origin) / across
+    ranges = (np.where(across > 0.0, high, low) - start) / across
     # 0: the wall in the east or west is met first; 1: the one in the north or south.
     side = ranges[1] < ranges[0]
     range_ = np.maximum(np.minimum(ranges[0], ranges[1]), 0.0)
-    climb = view.direction[2, index]
-    height = view.origin[2, index] + range_ * climb
-    along = _round_the_room(room, origin + range_ * across, across, side)
+    height = origin[2] + range_ * direction[2]
+    along = _round_the_room(room, start + range_ * across, across, side)
     seen = wall_colours(room, along, np.maximum(height, 0.0))
     over = np.flatnonzero(height > room.height)
-    up = (np.float32(room.height) - view.origin[2, index[over]]) / climb[over]
-    seen[over] = ceiling_colours(room, *(origin[:, over] + up * across[:, over]))
-    colours[index] = seen
+    up = (np.float32(room.height) - origin[2, over]) / direction[2, over]
+    seen[over] = ceiling_colours(room, *(start[:, over] + up * across[:, over]))
+    return seen
 
 
 def _round_the_room(

@@ -24,6 +24,8 @@ import cv2
 from nccs_pose.errors import SimulationError
 import numpy as np
 
+_STRIP = 16  # rows
+
 
 @dataclasses.dataclass(frozen=True)
 class SensorModel:
@@ -110,18 +112,27 @@ def expose(irradiance: np.ndarray, sensor: SensorModel, rng: np.random.Generator
     :param rng: source of all noise.
     :returns: (H, W, 3) uint8, BGR.
     """
-    if sensor.read_noise > 0.0 or sensor.shot_noise > 0.0:
-        noise = rng.standard_normal(irradiance.shape, dtype=np.float32)
-        if sensor.shot_noise > 0.0:
-            variance = np.maximum(irradiance, 0.0)
-            variance *= np.float32(sensor.shot_noise**2)
-            variance += np.float32(sensor.read_noise**2)
-            noise *= np.sqrt(variance, out=variance)
-        else:
-            noise *= np.float32(sensor.read_noise)
-        irradiance += noise
-    image = _quantise(irradiance, sensor.gamma)
+    image = np.empty(irradiance.shape, np.uint8)
+    # In strips that the processor's cache holds.
+    for top in range(0, len(irradiance), _STRIP):
+        strip = irradiance[top : top + _STRIP]
+        _add_noise(strip, sensor, rng)
+        image[top : top + _STRIP] = _quantise(strip, sensor.gamma)
     return compress(image, sensor.jpeg_quality) if sensor.jpeg_quality else image
+
+
+def _add_noise(irradiance: np.ndarray, sensor: SensorModel, rng: np.random.Generator) -> None:
+    if sensor.read_noise == 0.0 and sensor.shot_noise == 0.0:
+        return
+    noise = rng.standard_normal(irradiance.shape, dtype=np.float32)
+    if sensor.shot_noise > 0.0:
+        variance = np.maximum(irradiance, 0.0)
+        variance *= np.float32(sensor.shot_noise**2)
+        variance += np.float32(sensor.read_noise**2)
+        noise *= np.sqrt(variance, out=variance)
+    else:
+        noise *= np.float32(sensor.read_noise)
+    irradiance += noise
 
 
 def compress(image: np.ndarray, quality: int) -> np.ndarray:
