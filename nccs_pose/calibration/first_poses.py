@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.errors import EstimationError
+from nccs_pose.estimation.global_pose import solve
 from nccs_pose.estimation.pose_monomials import gram, monomial_rows
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import lines_in_base, side_gradient
@@ -118,23 +119,30 @@ def _best_position(matrix: Array, yaw: float) -> Pose2:
 
 
 def first_pose(
-    rig: Rig, line_map: LineMap, frame: FrameObservation,
+    rig: Rig, line_map: LineMap, frame: FrameObservation, *, rough: bool = True,
 ) -> tuple[Pose2 | None, float]:
     """The pose that explains one frame of known labels best, and its score (0 is perfect).
 
     The tape's edges count as its middle: under a rough rig half a width is little.
+
+    :param rough: whether the rig may be millimetres off; if not, the closed form is enough.
     """
     data = _Frame.of(rig, line_map, frame)
     if len(data.rays) < 6 or len(np.unique(data.label)) < 2:
         return None, float('inf')
-    poses = [data.at_heading(yaw) for yaw in np.linspace(-np.pi, np.pi, _HEADINGS, False)]
-    order = np.argsort([data.score(pose) for pose in poses])
+    if rough:
+        poses = [data.at_heading(yaw) for yaw in np.linspace(-np.pi, np.pi, _HEADINGS, False)]
+        order = np.argsort([data.score(pose) for pose in poses])
+        poses = [poses[index] for index in order[:_REFINED]]
+    else:
+        poses = [solution.pose for solution in solve(
+            data.rays, line_map.directions, line_map.moments, data.label)]
     best, lowest = None, float('inf')
-    for index in order[:_REFINED]:
+    for pose in poses:
         try:
             refined = refine(
                 data.rays, line_map.directions[data.label], line_map.moments[data.label],
-                poses[index], sigma=2.0, max_iterations=15)
+                pose, sigma=2.0, max_iterations=15)
         except EstimationError:
             continue
         score = data.score(refined.pose)
@@ -144,13 +152,13 @@ def first_pose(
 
 
 def first_poses(
-    rig: Rig, line_map: LineMap, frames: list[FrameObservation],
+    rig: Rig, line_map: LineMap, frames: list[FrameObservation], *, rough: bool = True,
 ) -> tuple[Array, Array]:
     """The same for many frames: T_map_base (F, 3), NaN where there is none, and scores (F,)."""
     middle = LineMap(tuple(replace(line, width=0.0) for line in line_map), line_map.frame)
     poses, scores = np.full((len(frames), 3), np.nan), np.full(len(frames), np.inf)
     for f, frame in enumerate(frames):
-        pose, scores[f] = first_pose(rig, middle, frame)
+        pose, scores[f] = first_pose(rig, middle, frame, rough=rough)
         if pose is not None:
             poses[f] = pose.as_array()
     return poses, scores

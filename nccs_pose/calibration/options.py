@@ -46,7 +46,9 @@ class CalibrationOptions:
         0.035, unit='rad', low=1e-6, high=0.5, doc='Of the camera against the mirror.')
     rough_height: float = option(0.02, unit='m', low=1e-6, high=1.0, doc='Of the height.')
     rough_tilt: float = option(
-        0.0175, unit='rad', low=1e-6, high=0.5, doc='Of the mirror against the robot.')
+        2.5e-3, unit='rad', low=1e-6, high=0.5,
+        doc='Of the mirror against the robot. Small: on a sphere it holds the turn about the '
+        'centre that no line can show.')
     rough_mirror: float = option(
         0.02, low=1e-6, high=0.5, doc="Of the mirror's shape, relative to its size.")
     rough_principal_point: float = option(

@@ -127,7 +127,7 @@ class RigParameters:
     def _azimuth(self, theta: Array) -> Array:
         """The turn (3, 3) about the mirror's axis that brings the centre of projection to x = 0."""
         x, y, _ = self._bare.cop + self._part(theta, 'cop_x', 'cop_y', 'cop_z')
-        return rotation_exp([0.0, 0.0, np.arctan(x / y) if x != 0.0 and y != 0.0 else 0.0])
+        return rotation_exp([0.0, 0.0, np.arctan2(x if y >= 0.0 else -x, abs(y))])
 
     def _map(self, theta: Array) -> LineMap:
         if not (self.lines or 'tape_width' in self.index):

@@ -38,7 +38,6 @@ _ROUNDS = 6
 _GOOD_FRAME = 0.85  # fraction of a frame's points that must be inliers
 _GOOD_SCALE = 3.0  # robust residual in units of the noise as told
 _GOOD_FRAMES = 0.7  # fraction of frames that must agree
-_START_FRAMES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +74,10 @@ def start(
     :param poses: T_map_base of every frame (F, 3) where something knows them, NaN where not.
     :raises CalibrationError: if no frame has a pose, or nothing fits.
     """
-    few = frames
-    if poses is None and len(frames) > _START_FRAMES:
-        few = [frames[i] for i in
-               np.linspace(0, len(frames) - 1, _START_FRAMES).round().astype(int)]
-        poses_few = None
-    else:
-        poses_few = poses
     best, failure = None, None
     for theta in _starts(parameters):
         try:
-            found = _settle(parameters, few, theta, poses_few)
+            found = _settle(parameters, frames, theta, poses)
         except (CalibrationError, GeometryError) as error:
             failure = failure or error
             continue
@@ -95,8 +87,6 @@ def start(
             break
     if best is None:
         raise failure or CalibrationError('no frame has a pose under the rough rig')
-    if few is not frames and best.settled:
-        return _settle(parameters, frames, best.adjustment.theta, None)
     return best
 
 

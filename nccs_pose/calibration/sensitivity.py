@@ -118,7 +118,7 @@ def side_sensitivity(
     from_base = _rotate(turn[frame], np.broadcast_to(rig.T_base_mirror.translation, m.shape)) + arm
     m_map = from_base.copy()
     m_map[:, :2] += poses[frame, :2]
-    line = _Lines(line_map, observations)
+    line = EdgeLines(line_map, observations.line, observations.side)
     a = line.moment + np.cross(line.direction, m_map)
     b = np.cross(r_map, line.direction)
     side = _dot(r_map, a)
@@ -152,16 +152,21 @@ def side_sensitivity(
     return Sensitivity(columns[0], hit, *columns[1:])
 
 
-class _Lines:
-    """The line, or edge of it, that each point is on."""
+class EdgeLines:
+    """The line, or edge of it, that each point is on.
 
-    def __init__(self, line_map: LineMap, observations: Observations) -> None:
-        index = observations.line
+    :ivar direction: (N, 3).
+    :ivar moment: (N, 3), metres.
+    """
+
+    def __init__(
+        self, line_map: LineMap, index: NDArray[np.intp], side: NDArray[np.int8],
+    ) -> None:
         left = np.cross([0.0, 0.0, 1.0], line_map.directions)
         # A line that stands upright has no left; nothing of it can be shifted that way.
         self.direction = line_map.directions[index]
         self.left = left[index]
-        self.half_side = 0.5 * observations.side
+        self.half_side = 0.5 * side
         shift = self.half_side * line_map.widths[index]
         self.middle = (0.5 * (line_map.starts + line_map.ends))[index] + shift[:, None] * self.left
         self.moment = np.cross(self.middle, self.direction)
