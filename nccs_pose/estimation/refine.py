@@ -18,13 +18,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.residual import whitened_residual
+from nccs_pose.estimation.residual import whitened_residual, whitened_residual_with_attitude
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rays
+import numpy as np
+from numpy.typing import NDArray
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
@@ -32,7 +31,7 @@ _CAUCHY = 2.385
 _GATE = 3.0
 # Where the lines say nothing the pose is still somewhere within 100 m and 10 rad: this keeps
 # every covariance finite and positive definite, and is too weak to move any pose.
-_VAGUE_INFORMATION = np.diag([1e-4, 1e-4, 1e-2])
+_VAGUE_INFORMATION = (1e-4, 1e-4, 1e-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +41,7 @@ class Refinement:
     :ivar pose: T_map_base.
     :ivar covariance: of (x, y, yaw), (3, 3); m^2, m rad, rad^2.
     :ivar information: of the inlying pixels alone (3, 3); singular where they see nothing.
+    :ivar attitude: height, roll and pitch off the plane (3,); zero where they were held.
     :ivar residual: whitened residuals at the pose (N,).
     :ivar inlier: which pixels the pose rests on (N,).
     :ivar scale: robust standard deviation of the whitened residuals; 1 when the noise is as told.
@@ -51,10 +51,52 @@ class Refinement:
     pose: Pose2
     covariance: Array
     information: Array
+    attitude: Array
     residual: Array
     inlier: NDArray[np.bool_]
     scale: float
     converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Pixels, lines, their noise, and what is known of the unknowns beforehand.
+
+    The unknowns are (x, y, yaw), followed by (z, roll, pitch) where those are free.
+    """
+
+    rays: Rays
+    directions: Array
+    moments: Array
+    sigma: Array
+    sigma_world: float
+    expected: Array
+    information: Array
+
+    def residual(self, unknowns: Array) -> tuple[Array, Array]:
+        pose = Pose2.from_array(unknowns[:3])
+        if len(unknowns) == 3:
+            return whitened_residual(
+                self.rays, self.directions, self.moments, pose, self.sigma, self.sigma_world)
+        return whitened_residual_with_attitude(
+            self.rays, self.directions, self.moments, pose, unknowns[3:], self.sigma,
+            self.sigma_world)
+
+    def deviation(self, unknowns: Array) -> Array:
+        difference = unknowns - self.expected
+        difference[2] = wrap_angle(difference[2])
+        return difference
+
+    def cost(self, e: Array, width: float, unknowns: Array) -> float:
+        """Cauchy's loss of the residuals, or their squares for an infinite width, and the prior."""
+        loss = e @ e if np.isinf(width) else width**2 * np.log1p((e / width) ** 2).sum()
+        deviation = self.deviation(unknowns)
+        return float(loss + deviation @ self.information @ deviation)
+
+    def of(self, chosen: NDArray[np.bool_]) -> _Problem:
+        return _Problem(
+            self.rays[chosen], self.directions[chosen], self.moments[chosen], self.sigma[chosen],
+            self.sigma_world, self.expected, self.information)
 
 
 def refine(
@@ -66,6 +108,7 @@ def refine(
     sigma: Array | float = 1.0,
     sigma_world: float = 0.0,
     prior: tuple[Pose2, Array] | None = None,
+    attitude_sigma: tuple[float, float] = (0.0, 0.0),
     robust: bool = True,
     max_iterations: int = 30,
 ) -> Refinement:
@@ -80,6 +123,8 @@ def refine(
     :param sigma: standard deviation of the pixels along the curve's normal, px.
     :param sigma_world: standard deviation of the lines' own position, metres.
     :param prior: a pose with its covariance (3, 3), weighed in like a measurement.
+    :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
+        roll and pitch, rad; what is known to zero is held, the rest is estimated beside the pose.
     :param robust: False takes every pixel for an inlier.
     :raises EstimationError: with fewer than three rays, or a ray that missed the mirror.
     """
@@ -88,27 +133,47 @@ def refine(
     if not rays.hit.all():
         raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
     sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
-    everything = np.ones(len(rays), dtype=bool)
-    data = (rays, directions, moments, sigma, sigma_world)
-    pose, converged = start, True
-    inlier, scale = everything, 1.0
+    expected, known = _prior(start, prior, attitude_sigma)
+    problem = _Problem(rays, directions, moments, sigma, sigma_world, expected, known)
+    unknowns = np.concatenate([start.as_array(), expected[3:]])
+    inlier, scale, converged = np.ones(len(rays), dtype=bool), 1.0, True
     if robust:
-        pose, converged = _descend(data, pose, prior, everything, True, max_iterations)
-        e, _ = whitened_residual(rays, directions, moments, pose, sigma, sigma_world)
+        unknowns, converged = _descend(problem, unknowns, True, max_iterations)
+        e, _ = problem.residual(unknowns)
         scale = _robust_scale(e)
         inlier = np.abs(e) <= _GATE * scale
-    pose, finished = _descend(data, pose, prior, inlier, False, max_iterations)
-    e, jacobian = whitened_residual(rays, directions, moments, pose, sigma, sigma_world)
-    information = jacobian[inlier].T @ jacobian[inlier]
+    unknowns, finished = _descend(problem.of(inlier), unknowns, False, max_iterations)
+    e, jacobian = problem.residual(unknowns)
+    normal = jacobian[inlier].T @ jacobian[inlier]
     # Residuals larger than the noise was told to be widen the claim; smaller ones do not
     # narrow it.
     degrees = max(1, int(inlier.sum()) - 3)
     inflation = max(1.0, float(e[inlier] @ e[inlier]) / degrees)
-    total = information / inflation + _prior_terms(prior, pose)[0] + _VAGUE_INFORMATION
-    covariance = np.linalg.inv(total)
+    covariance = np.linalg.inv(normal / inflation + known)[:3, :3]
+    attitude = unknowns[3:] if len(unknowns) == 6 else np.zeros(3)
     return Refinement(
-        pose, 0.5 * (covariance + covariance.T), information, e, inlier, scale,
-        converged and finished)
+        Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
+        attitude, e, inlier, scale, converged and finished)
+
+
+def _prior(
+    start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Expected unknowns and the information about them, before any pixel is seen."""
+    height, tilt = attitude_sigma
+    free = height > 0.0 or tilt > 0.0
+    expected = np.zeros(6 if free else 3)
+    information = np.zeros((len(expected), len(expected)))
+    expected[:3] = start.as_array() if prior is None else prior[0].as_array()
+    if prior is not None:
+        information[:3, :3] = np.linalg.inv(prior[1])
+    else:
+        information[:3, :3] = np.diag(_VAGUE_INFORMATION)
+    if free:
+        # A tenth of a micrometre and of a microradian stand for 'held'.
+        information[3, 3] = 1.0 / max(height, 1e-7) ** 2
+        information[4, 4] = information[5, 5] = 1.0 / max(tilt, 1e-7) ** 2
+    return expected, information
 
 
 def _robust_scale(e: Array) -> float:
@@ -116,57 +181,29 @@ def _robust_scale(e: Array) -> float:
     return max(1.0, 1.4826 * float(np.median(np.abs(e))))
 
 
-def _prior_terms(prior: tuple[Pose2, Array] | None, pose: Pose2) -> tuple[Array, Array]:
-    """Information (3, 3) of the prior and its weighted deviation (3,) at a pose."""
-    if prior is None:
-        return np.zeros((3, 3)), np.zeros(3)
-    deviation = pose.as_array() - prior[0].as_array()
-    deviation[2] = wrap_angle(deviation[2])
-    information = np.linalg.inv(prior[1])
-    return information, information @ deviation
-
-
 def _descend(
-    data: tuple[Rays, Array, Array, Array, float],
-    pose: Pose2,
-    prior: tuple[Pose2, Array] | None,
-    inlier: NDArray[np.bool_],
-    cauchy: bool,
-    max_iterations: int,
-) -> tuple[Pose2, bool]:
-    """Levenberg-Marquardt from a pose; returns where it ends and whether it converged."""
-    if not inlier.all():
-        rays, directions, moments, sigma, sigma_world = data
-        data = (rays[inlier], directions[inlier], moments[inlier], sigma[inlier], sigma_world)
+    problem: _Problem, unknowns: Array, cauchy: bool, max_iterations: int,
+) -> tuple[Array, bool]:
+    """Levenberg-Marquardt; returns where it ends and whether it converged."""
     damping = 0.0
-    e, jacobian = whitened_residual(*data[:3], pose, *data[3:])
+    e, jacobian = problem.residual(unknowns)
     for _ in range(max_iterations):
         width = _CAUCHY * _robust_scale(e) if cauchy else np.inf
         weight = 1.0 / (1.0 + (e / width) ** 2)
-        information, pull = _prior_terms(prior, pose)
-        normal = (jacobian * weight[:, None]).T @ jacobian + information + _VAGUE_INFORMATION
-        slope = jacobian.T @ (weight * e) + pull
+        normal = (jacobian * weight[:, None]).T @ jacobian + problem.information
+        slope = (jacobian.T @ (weight * e)
+                 + problem.information @ problem.deviation(unknowns))
         step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
-        trial = Pose2.from_array(pose.as_array() + step)
-        e_trial, jacobian_trial = whitened_residual(*data[:3], trial, *data[3:])
-        if _cost(e_trial, width, prior, trial) <= _cost(e, width, prior, pose):
-            pose, e, jacobian = trial, e_trial, jacobian_trial
+        trial = unknowns + step
+        e_trial, jacobian_trial = problem.residual(trial)
+        if problem.cost(e_trial, width, trial) <= problem.cost(e, width, unknowns):
+            unknowns, e, jacobian = trial, e_trial, jacobian_trial
             damping *= 0.1 if damping > 1e-6 else 0.0
         else:
             damping = max(1e-3, 10.0 * damping)
         # A step far below what the pixels can tell ends the search.
         if float(step @ normal @ step) < 1e-10:
-            return pose, True
+            return unknowns, True
         if damping > 1e8:
-            return pose, False
-    return pose, False
-
-
-def _cost(e: Array, width: float, prior: tuple[Pose2, Array] | None, pose: Pose2) -> float:
-    """Cauchy's loss of the residuals, or their squares for an infinite width, and the prior."""
-    loss = e @ e if np.isinf(width) else width**2 * np.log1p((e / width) ** 2).sum()
-    if prior is None:
-        return float(loss)
-    deviation = pose.as_array() - prior[0].as_array()
-    deviation[2] = wrap_angle(deviation[2])
-    return float(loss + deviation @ _prior_terms(prior, pose)[1])
+            return unknowns, False
+    return unknowns, False

@@ -1,0 +1,261 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which strip of floor is which line of the map, and so where the robot is, from one image.
+
+Every pair of strips laid on every pair of map lines with the same angle between them fixes a
+pose but for a half turn; extents and all other strips decide. What comes out is every pose that
+explains the image, best first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+import numpy as np
+from numpy.typing import NDArray
+
+# Strips that start hypotheses, and hypotheses that are looked at closely.
+_SEEDS = 6
+_CLOSE = 200
+_REFINED = 24
+# Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
+_CROSSING = 0.12
+_ANGLE_GATE = 0.07
+# Strips may reach this much beyond a map line's ends, metres.
+_BEYOND = 0.2
+# Samples on each strip and on each map line.
+_SAMPLES = 12
+# Poses this close are the same, metres and rad.
+_SAME_PLACE = 0.25
+_SAME_YAW = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class _FloorLines:
+    """The map's floor lines of one image's colours, as 2-D lines n . p = c."""
+
+    start: Array
+    direction: Array
+    normal: Array
+    offset: Array
+    length: Array
+
+    @classmethod
+    def of(cls, line_map: LineMap) -> _FloorLines:
+        start, direction = line_map.starts[:, :2], line_map.directions[:, :2]
+        normal = np.column_stack([-direction[:, 1], direction[:, 0]])
+        return cls(
+            start, direction, normal, np.einsum('li,li->l', normal, start), line_map.lengths)
+
+
+def global_candidates(
+    segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable, most: int = 8,
+) -> tuple[Candidate, ...]:
+    """Poses that explain the strips, best first; none where fewer than two strips cross.
+
+    A candidate's score is the harmonic mean of two fractions: of the strips' pixels that lie on
+    map lines, and of the map lines in view that strips lie on.
+    """
+    lines = _FloorLines.of(line_map)
+    poses = _hypotheses(segments[:_SEEDS], lines)
+    if len(poses) == 0:
+        return ()
+    scorer = _Scorer(segments, lines, table)
+    claimed = scorer.claimed(poses)
+    poses = poses[np.argsort(-claimed, kind='stable')[:_CLOSE]]
+    score = scorer.score(poses)
+    order = np.argsort(-score, kind='stable')[:_REFINED]
+    refined = np.array([scorer.refine(pose) for pose in poses[order]])
+    score = scorer.score(refined)
+    return _distinct(refined, score, most)
+
+
+def score_pose(
+    pose: Pose2, segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable,
+) -> float:
+    """The score that :func:`global_candidates` would give a pose, 0 to 1."""
+    if not segments:
+        return 0.0
+    scorer = _Scorer(segments, _FloorLines.of(line_map), table)
+    return float(scorer.score(pose.as_array()[None])[0])
+
+
+def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array:
+    """Poses (H, 3) that lay a pair of strips on a pair of map lines."""
+    map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
+    a, b = (index.ravel() for index in np.indices((len(map_angle), len(map_angle))))
+    between_lines = map_angle[a] - map_angle[b]
+    poses = []
+    for i, first in enumerate(segments):
+        for second in segments[i + 1:]:
+            angles = [np.arctan2(-s.normal[0], s.normal[1]) for s in (first, second)]
+            between = angles[0] - angles[1]
+            if abs(np.sin(between)) < np.sin(_CROSSING):
+                continue
+            match = np.abs(np.sin(between_lines - between)) < np.sin(_ANGLE_GATE)
+            match &= a != b
+            for turn in (0.0, np.pi):
+                yaw_a = map_angle[a[match]] - angles[0] + turn
+                off = np.sin(2.0 * (map_angle[b[match]] - angles[1] - yaw_a)) / 2.0
+                poses.append(_intersect(
+                    yaw_a + 0.5 * off, first, second, a[match], b[match], lines))
+    return np.concatenate(poses) if poses else np.zeros((0, 3))
+
+
+def _intersect(
+    yaw: Array, first: FloorSegment, second: FloorSegment, a: NDArray[np.intp],
+    b: NDArray[np.intp], lines: _FloorLines,
+) -> Array:
+    """Poses (K, 3) that put the strips' middles on lines a and b (K,), where the extents agree."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    rotation = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], axis=1)
+    matrix = np.stack([lines.normal[a], lines.normal[b]], axis=1)
+    right = np.stack([
+        lines.offset[line] - np.einsum(
+            'ki,kij,j->k', lines.normal[line], rotation, 0.5 * (strip.start + strip.end))
+        for strip, line in ((first, a), (second, b))], axis=1)
+    t = np.linalg.solve(matrix, right[..., None])[..., 0]
+    fits = np.ones(len(yaw), dtype=bool)
+    for strip, line in ((first, a), (second, b)):
+        for end in (strip.start, strip.end):
+            along = np.einsum(
+                'ki,ki->k', lines.direction[line], rotation @ end + t - lines.start[line])
+            fits &= (along > -_BEYOND) & (along < lines.length[line] + _BEYOND)
+    return np.column_stack([t, yaw])[fits]
+
+
+class _Scorer:
+    """How well poses explain the strips of one image."""
+
+    def __init__(
+        self, segments: tuple[FloorSegment, ...], lines: _FloorLines, table: FloorTable,
+    ) -> None:
+        self._lines = lines
+        self._table = table
+        share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        starts = np.array([s.start for s in segments])
+        ends = np.array([s.end for s in segments])
+        self._points = (starts[:, None] + share[:, None] * (ends - starts)[:, None]).reshape(-1, 2)
+        self._weight = np.repeat([s.weight / _SAMPLES for s in segments], _SAMPLES)
+        self._tolerance = np.repeat([0.06 + 1.5 * s.footprint for s in segments], _SAMPLES)
+        self._segment_start, self._segment_end = starts, ends
+        self._segment_tolerance = np.array([0.06 + 1.5 * s.footprint for s in segments])
+        self._map_points = (
+            lines.start[:, None]
+            + (share * lines.length[:, None])[..., None] * lines.direction[:, None])
+
+    def _on_lines(self, poses: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Whether each sample (H, P) lies on a map line, which one, and how far off it."""
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        x = c[:, None] * self._points[:, 0] - s[:, None] * self._points[:, 1] + poses[:, :1]
+        y = s[:, None] * self._points[:, 0] + c[:, None] * self._points[:, 1] + poses[:, 1:2]
+        lines = self._lines
+        best = np.full(x.shape, np.inf)
+        which = np.zeros(x.shape, dtype=np.intp)
+        # One line at a time keeps the arrays small where maps are large.
+        for k in range(len(lines.length)):
+            across = lines.normal[k, 0] * x + lines.normal[k, 1] * y - lines.offset[k]
+            along = (lines.direction[k, 0] * (x - lines.start[k, 0])
+                     + lines.direction[k, 1] * (y - lines.start[k, 1]))
+            outside = (along < -_BEYOND) | (along > lines.length[k] + _BEYOND)
+            distance = np.where(outside, np.inf, np.abs(across))
+            closer = distance < best
+            best = np.where(closer, distance, best)
+            which = np.where(closer, k, which)
+        return best < self._tolerance, which, best
+
+    def claimed(self, poses: Array) -> Array:
+        """Fraction of the strips' pixels on map lines (H,)."""
+        on, _, _ = self._on_lines(poses)
+        return on @ self._weight / self._weight.sum()
+
+    def explained(self, poses: Array) -> Array:
+        """Fraction of the map lines in view that strips lie on (H,)."""
+        h = len(poses)
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        flat = self._map_points.reshape(-1, 2)
+        dx, dy = flat[:, 0] - poses[:, :1], flat[:, 1] - poses[:, 1:2]
+        base = np.stack([c[:, None] * dx + s[:, None] * dy, -s[:, None] * dx + c[:, None] * dy], 2)
+        pixels = self._table.pixels(base.reshape(-1, 2))
+        seen = _visible(self._table, pixels).reshape(h, -1)
+        # A metre of tape far away fills fewer pixels: count it by its length in the image.
+        image = pixels.reshape(h, len(self._lines.length), _SAMPLES, 2)
+        step = np.linalg.norm(np.gradient(image, axis=2), axis=3).reshape(h, -1)
+        weight = seen * np.minimum(step, 60.0)
+        covered = np.zeros(seen.shape, dtype=bool)
+        for start, end, tolerance in zip(
+                self._segment_start, self._segment_end, self._segment_tolerance):
+            along = (end - start) / np.linalg.norm(end - start)
+            offset = base - start
+            reach = offset @ along
+            across = np.abs(offset @ np.array([-along[1], along[0]]))
+            covered |= ((across < tolerance) & (reach > -_BEYOND)
+                        & (reach < np.linalg.norm(end - start) + _BEYOND))
+        return (weight * covered).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
+
+    def score(self, poses: Array) -> Array:
+        """Harmonic mean of both fractions (H,)."""
+        claimed, explained = self.claimed(poses), self.explained(poses)
+        return 2.0 * claimed * explained / np.maximum(claimed + explained, 1e-9)
+
+    def refine(self, pose: Array) -> Array:
+        """Lay the strips on their lines by least squares on the floor, from one pose (3,)."""
+        for _ in range(3):
+            on, which, _ = self._on_lines(pose[None])
+            chosen, line = on[0], which[0]
+            if chosen.sum() < 4:
+                return pose
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            turned = self._points[chosen] @ np.array([[c, s], [-s, c]])
+            normal = self._lines.normal[line[chosen]]
+            error = (np.einsum('ni,ni->n', normal, turned + pose[:2])
+                     - self._lines.offset[line[chosen]])
+            by_yaw = normal[:, 1] * turned[:, 0] - normal[:, 0] * turned[:, 1]
+            jacobian = np.column_stack([normal, by_yaw]) / self._tolerance[chosen, None]
+            normal_matrix = jacobian.T @ jacobian + 1e-6 * np.eye(3)
+            pose = pose - np.linalg.solve(
+                normal_matrix, jacobian.T @ (error / self._tolerance[chosen]))
+        return pose
+
+
+def _visible(table: FloorTable, pixels: Array) -> NDArray[np.bool_]:
+    height, width = table.region.shape
+    column = np.clip(np.rint(pixels[:, 0]), -1, width).astype(int)
+    row = np.clip(np.rint(pixels[:, 1]), -1, height).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    return inside & (table.region[row * inside, column * inside] > 0)
+
+
+def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:
+    """The best of each group of poses that are the same."""
+    found: list[Candidate] = []
+    for index in np.argsort(-score, kind='stable'):
+        pose = Pose2.from_array(poses[index])
+        if all(not same_pose(pose, other.pose) for other in found):
+            found.append(Candidate(pose, float(score[index])))
+        if len(found) == most:
+            break
+    return tuple(found)
+
+
+def same_pose(a: Pose2, b: Pose2) -> bool:
+    """Whether two poses are close enough to converge to one."""
+    return (np.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
+            and abs(float(wrap_angle(a.yaw - b.yaw))) < _SAME_YAW)

@@ -1,0 +1,213 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Blobs laid on the floor: a floor line is a straight band of known width there, or no line.
+
+Through a curved mirror a line is a curve, but each of its pixels is one point of the floor, and
+those lie on a straight strip as wide as the tape. That refuses what is no tape (plants, boxes,
+signs), splits a blob over two crossing tapes, and joins a tape that something cut in pieces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.pose import Array
+from nccs_pose.vision.segment import Segmentation
+import numpy as np
+from numpy.typing import NDArray
+
+# A line needs so many pixels and so much length, metres.
+_LEAST_PIXELS = 10
+_LEAST_LENGTH = 0.2
+# Pieces further apart than this are not joined, metres.
+_LONGEST_GAP = 0.8
+# Something this close beside a strip, metres, makes it part of a larger thing.
+_BESIDE = 0.15
+# Lines drawn through random pairs of pixels of a blob that is no single line.
+_PAIRS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class FloorSegment:
+    """A straight strip of the floor in base_link: normal . p = offset between two ends.
+
+    :ivar normal: unit (2,).
+    :ivar offset: metres.
+    :ivar start: one end (2,), metres.
+    :ivar end: the other end (2,), metres.
+    :ivar weight: how many pixels it is made of.
+    :ivar footprint: how far its pixels reach across it on the floor, metres (median).
+    :ivar pixels: those pixels (M, 2), in the image.
+    """
+
+    normal: Array
+    offset: float
+    start: Array
+    end: Array
+    weight: float
+    footprint: float
+    pixels: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Floor points with their Jacobian by the pixel, blob and weight."""
+
+    floor: Array
+    jacobian: Array
+    blob: NDArray[np.intp]
+    weight: Array
+
+    def tolerance(self, normal: Array, width: float) -> Array:
+        """How far from a tape's midline its pixels may be (..., P), for normals (..., 2)."""
+        footprint = np.linalg.norm(np.einsum('pij,...i->...pj', self.jacobian, normal), axis=-1)
+        return 0.5 * width + 0.75 * footprint + 0.005
+
+
+def floor_segments(
+    segmentation: Segmentation, table: FloorTable, width: float, most: int = 16,
+) -> tuple[FloorSegment, ...]:
+    """Straight strips among the blobs, those of most pixels first.
+
+    :param width: width of the tapes, metres.
+    :param most: at most so many.
+    """
+    if len(segmentation.pixels) == 0:
+        return ()
+    floor, jacobian = table.floor(segmentation.pixels)
+    points = _Points(floor, jacobian, segmentation.label, segmentation.weight)
+    normals, offsets = _candidates(points, width)
+    free = np.ones(len(floor), dtype=bool)
+    segments: list[FloorSegment] = []
+    distance = np.abs(normals @ floor.T - offsets[:, None])
+    near = distance < points.tolerance(normals, width)
+    alive = np.ones(len(normals), dtype=bool)
+    while len(segments) < most and alive.any():
+        support = np.where(alive, (near & free) @ points.weight, 0.0)
+        best = int(support.argmax())
+        alive[best] = False
+        if support[best] < _LEAST_PIXELS:
+            break
+        found = _strip(points, free, near[best] & free, normals[best], width)
+        if found is None:
+            continue
+        normal, offset, inside, beside = found
+        if beside < 0.5:
+            segments.append(_segment(points, segmentation.pixels, inside, normal, offset))
+        free &= ~inside
+    segments.sort(key=lambda s: -s.weight)
+    return tuple(segments)
+
+
+def _candidates(points: _Points, width: float) -> tuple[Array, Array]:
+    """Lines (C, 2), (C,) that may run through the blobs: each blob's own, and pairs of its pixels."""
+    normals, offsets = [], []
+    bounds = np.flatnonzero(np.diff(points.blob, prepend=-1, append=-1))
+    rng = np.random.default_rng(0)
+    for first, last in zip(bounds[:-1], bounds[1:]):
+        if last - first < 3:
+            continue
+        chosen = slice(first, last)
+        normal, offset = _fit(points.floor[chosen], _precision(points.jacobian[chosen], width))
+        normals.append(normal)
+        offsets.append(offset)
+        floor = points.floor[chosen]
+        part = _Points(floor, points.jacobian[chosen], points.blob[chosen], points.weight[chosen])
+        misfit = np.abs(floor @ normal - offset) > part.tolerance(normal, width)
+        if misfit.mean() > 0.15 and last - first >= _LEAST_PIXELS:
+            pair = floor[rng.integers(0, last - first, (_PAIRS, 2))]
+            along = pair[:, 1] - pair[:, 0]
+            length = np.linalg.norm(along, axis=1)
+            pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
+            across = np.column_stack([-along[:, 1], along[:, 0]])
+            normals.extend(across)
+            offsets.extend(np.einsum('ni,ni->n', across, pair[:, 0]))
+    return np.array(normals).reshape(-1, 2), np.array(offsets)
+
+
+def _precision(jacobian: Array, width: float) -> Array:
+    """Weight of floor points (P,): far pixels cover much floor and say little."""
+    return 1.0 / (np.einsum('pij,pij->p', jacobian, jacobian) + 0.1 * width**2)
+
+
+def _fit(floor: Array, weight: Array) -> tuple[Array, float]:
+    """Total least squares line: unit normal (2,) and offset."""
+    mean = weight @ floor / weight.sum()
+    moved = floor - mean
+    xx, yy = weight @ moved[:, 0] ** 2, weight @ moved[:, 1] ** 2
+    xy = weight @ (moved[:, 0] * moved[:, 1])
+    # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    return normal, float(normal @ mean)
+
+
+def _strip(
+    points: _Points, free: NDArray[np.bool_], inside: NDArray[np.bool_], normal: Array,
+    width: float,
+) -> tuple[Array, float, NDArray[np.bool_], float] | None:
+    """Refine a strip on its own pixels.
+
+    :returns: normal, offset, its pixels (P,), and how much lies beside it over what lies in it;
+        None where too little is left.
+    """
+    offset = 0.0
+    for _ in range(2):
+        normal, offset = _fit(
+            points.floor[inside], _precision(points.jacobian[inside], width))
+        across = np.abs(points.floor @ normal - offset)
+        tolerance = points.tolerance(normal, width)
+        inside = _longest_run(points, normal, free & (across < tolerance))
+        if points.weight[inside].sum() < _LEAST_PIXELS:
+            return None
+    along = points.floor @ np.array([-normal[1], normal[0]])
+    low, high = along[inside].min(), along[inside].max()
+    if high - low < _LEAST_LENGTH:
+        return None
+    # Only what hangs together with the strip counts: another tape may well cross it.
+    own = np.isin(points.blob, np.unique(points.blob[inside]))
+    beside = (own & (across > tolerance) & (across < tolerance + _BESIDE)
+              & (along > low) & (along < high))
+    return normal, offset, inside, float(
+        points.weight[beside].sum() / points.weight[inside].sum())
+
+
+def _longest_run(
+    points: _Points, normal: Array, inside: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Of a strip's pixels those of its heaviest part without a long gap (P,)."""
+    index = np.flatnonzero(inside)
+    if len(index) == 0:
+        return inside
+    along = points.floor[index] @ np.array([-normal[1], normal[0]])
+    order = np.argsort(along, kind='stable')
+    part = np.concatenate([[0], np.cumsum(np.diff(along[order]) > _LONGEST_GAP)])
+    mass = np.bincount(part, weights=points.weight[index[order]])
+    result = np.zeros_like(inside)
+    result[index[order[part == mass.argmax()]]] = True
+    return result
+
+
+def _segment(
+    points: _Points, pixels: Array, inside: NDArray[np.bool_], normal: Array, offset: float,
+) -> FloorSegment:
+    direction = np.array([-normal[1], normal[0]])
+    along = points.floor[inside] @ direction
+    footprint = np.linalg.norm(points.jacobian[inside].transpose(0, 2, 1) @ normal, axis=1)
+    return FloorSegment(
+        normal, offset, offset * normal + along.min() * direction,
+        offset * normal + along.max() * direction, float(points.weight[inside].sum()),
+        float(np.median(footprint)), pixels[inside])

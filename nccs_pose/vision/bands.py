@@ -1,0 +1,55 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where in the image to look for tapes: narrow bands along predicted curves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.geometry.pose import Array
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """N stations along the predicted images of tapes.
+
+    :ivar centre: middle between the tape's two predicted edges (N, 2), px.
+    :ivar midline: predicted image of the tape's midline (N, 2), px; it is not the middle.
+    :ivar across: unit normal of the curve (N, 2), towards the tape's left edge.
+    :ivar along: unit tangent (N, 2).
+    :ivar bend: curvature of the curve towards ``across`` (N,), 1/px.
+    :ivar half_width: half of the tape's width along ``across`` (N,), px.
+    :ivar spacing: length of curve that the station stands for (N,), px.
+    :ivar label: index of the line in the map (N,).
+    """
+
+    centre: Array
+    midline: Array
+    across: Array
+    along: Array
+    bend: Array
+    half_width: Array
+    spacing: Array
+    label: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    def __getitem__(self, index: NDArray[np.bool_]) -> Bands:
+        return Bands(
+            self.centre[index], self.midline[index], self.across[index], self.along[index],
+            self.bend[index], self.half_width[index], self.spacing[index], self.label[index])

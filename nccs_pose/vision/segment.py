@@ -1,0 +1,126 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From an image to blobs that can be lines: colour threshold, morphology, connected regions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+from nccs_pose.errors import VisionError
+from nccs_pose.geometry.pose import Array
+from nccs_pose.vision.colour import CONTRASTS
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.uint8]
+
+# Hue, saturation, value ranges of OpenCV for the classes that have a hue; the paper's way.
+_HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
+    'green': ((40, 50, 40), (90, 255, 255)),
+    'yellow': ((20, 80, 60), (35, 255, 255)),
+    'blue': ((95, 80, 40), (130, 255, 255)),
+    'magenta': ((140, 60, 40), (170, 255, 255)),
+    'cyan': ((80, 60, 40), (100, 255, 255)),
+}
+# Smaller blobs are noise, px.
+_SMALLEST = 6
+# More blobs than this are clutter; the largest are kept.
+_MOST = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What in an image has the colour of a line.
+
+    :ivar mask: (H, W) uint8, 255 where it has.
+    :ivar pixels: pixels (P, 2) of the blobs, u and v, at most a fixed number of each blob.
+    :ivar label: blob of each (P,).
+    :ivar weight: how many pixels of its blob each stands for (P,).
+    """
+
+    mask: Mask
+    pixels: Array
+    label: NDArray[np.intp]
+    weight: Array
+
+
+def chromatic_mask(
+    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int,
+) -> Mask:
+    """Where the image has more of a colour than its surroundings.
+
+    The colour's contrast is a difference of channels (for white, their sum), so brightness and
+    a cast that changes slowly over the image cancel; the threshold rises with the noise.
+
+    :param image: (H, W, 3) uint8 BGR.
+    :param gate: threshold in standard deviations of the image's noise.
+    :param least: smallest contrast that counts, as a fraction of the image's brightness.
+    :param window: width of the surroundings, px.
+    """
+    weights = np.array(CONTRASTS[colour])
+    if abs(weights.sum()) > 1e-9:
+        weights, offset = weights / 3.0, 0.0 if weights.sum() > 0.0 else 255.0
+    else:
+        offset = 128.0
+    feature = cv2.transform(image, np.append(weights, offset)[None].astype(np.float32))
+    feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
+    around = cv2.blur(feature, (window, window))
+    sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
+    noise = 1.4826 * float(np.median(np.abs(sparse)))
+    brightness = float(np.median(image[::8, ::8, 1]))
+    threshold = max(2.0, gate * noise, least * brightness)
+    return cv2.threshold(
+        cv2.subtract(feature, around), threshold, 255.0, cv2.THRESH_BINARY)[1]
+
+
+def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
+    """Where hue, saturation and value lie in the colour's fixed ranges: the paper's threshold.
+
+    :raises VisionError: if the colour has no hue.
+    """
+    if colour not in _HSV_RANGES:
+        raise VisionError(
+            f'colour {colour!r} has no hue range; use the chromaticity threshold for it')
+    low, high = _HSV_RANGES[colour]
+    return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), low, high)
+
+
+def find_blobs(mask: Mask, pixels_per_blob: int) -> Segmentation:
+    """Close small gaps and collect the connected regions of a mask.
+
+    Tapes may be a pixel wide, so nothing is ever eroded.
+
+    :param mask: (H, W) uint8, 255 inside.
+    """
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    order = np.argsort(-area, kind='stable')[:_MOST]
+    kept = order[area[order] >= _SMALLEST] + 1
+    number = np.full(count, -1, dtype=np.intp)
+    number[kept] = np.arange(len(kept))
+    points = cv2.findNonZero(closed)
+    points = np.zeros((0, 2), np.intp) if points is None else points.reshape(-1, 2)
+    blob = number[labels[points[:, 1], points[:, 0]]]
+    points, blob = points[blob >= 0], blob[blob >= 0]
+    order = np.argsort(blob, kind='stable')
+    points, blob = points[order], blob[order]
+    size = np.bincount(blob, minlength=len(kept))
+    stride = np.maximum(1, size // pixels_per_blob)
+    first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.intp)
+    chosen = (np.arange(len(blob)) - first[blob]) % stride[blob] == 0
+    return Segmentation(
+        closed, points[chosen].astype(float), blob[chosen], stride[blob[chosen]].astype(float))
