@@ -61,7 +61,9 @@ class Solution:
     :ivar chi2: sum of squared whitened residuals.
     :ivar information: of (x, y, yaw) at the pose (3, 3), with the noise as told.
     :ivar covariance: its inverse; None with an unobserved direction.
-    :ivar unobserved: directions that are not fixed, worst first; empty when all are.
+    :ivar unobserved: directions that a central camera in the place of this one would not fix,
+        worst first. What the little distance between the rays tells of them changes so fast
+        along the way that the information at one pose is no measure of it.
     :ivar symmetry: of the lines that have rays.
     """
 
@@ -104,7 +106,7 @@ def solve(
             found.append(solution)
     found = _equally_good(found, len(data))
     lines = symmetry(data.directions, data.moments).shifted(data.origin)
-    return tuple(_solution(entry, lines, data.origin) for entry in found)
+    return tuple(_solution(data, entry, lines) for entry in found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +124,9 @@ def _equally_good(found: list[_Found], n_rays: int) -> list[_Found]:
     most = max(entry.in_front for entry in found)
     if most < 0.5:
         raise EstimationError(
-            f'every pose that fits has its lines behind the mirror ({100 * (1 - most):.0f} % of '
-            'the rays): the mounting or the labels are wrong')
+            f'every pose that fits has its lines behind the mirror or in it, for '
+            f'{100.0 * (1.0 - most):.0f} % of the rays: the mounting or the labels are wrong, or '
+            'the lines too few')
     found = [entry for entry in found if entry.in_front >= most - _VIRTUAL]
     limit = _limit(found, n_rays)
     return sorted((entry for entry in found if entry.chi2 <= limit), key=lambda e: e.chi2)
@@ -185,9 +188,10 @@ def _difference(a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi)
 
 
-def _solution(found: _Found, lines: Symmetry, origin: Array) -> Solution:
-    pose = Pose2(found.pose.x + origin[0], found.pose.y + origin[1], found.pose.yaw)
-    unobserved = unobserved_directions(found.information, pose)
+def _solution(data: LabelledRays, found: _Found, lines: Symmetry) -> Solution:
+    x, y = (found.pose.x + data.origin[0], found.pose.y + data.origin[1])
+    pose = Pose2(x, y, found.pose.yaw)
+    unobserved = unobserved_directions(data.central_information(found.pose), pose)
     covariance = None
     if not unobserved:
         covariance = np.asarray(np.linalg.inv(found.information), dtype=float)

@@ -20,11 +20,19 @@ from functools import cached_property
 import math
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.pose_monomials import feet_in_plan, monomial_rows, monomials
+from nccs_pose.estimation.pose_monomials import (
+    feet_in_plan,
+    monomial_rows,
+    monomials,
+    monomials_jacobian,
+)
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
 from numpy.typing import ArrayLike
+
+# No line is nearer to the viewpoint than this many times the distance at which rays pass it.
+_CLEAR = 5.0
 
 
 class LabelledRays:
@@ -107,33 +115,68 @@ class LabelledRays:
 
     @cached_property
     def _viewpoint(self) -> Array:
-        """How far along each ray (N,) it passes the point nearest to all of them, metres.
-
-        That point is in or close to the mirror, which is small beside the distances to lines.
-        """
+        """The point (3,) nearest to all rays, in or close to the mirror."""
         r, w = self.rays.direction, self.rays.moment
-        # r x w is the foot of the ray, from which lengths along it count. Parallel rays pass
-        # no point; the small term takes one of their feet.
+        # r x w is the foot of the ray. Parallel rays pass no point; the small term takes one.
         across = r.T @ w
         feet = np.array([
             across[1, 2] - across[2, 1], across[2, 0] - across[0, 2], across[0, 1] - across[1, 0]])
-        return r @ np.linalg.solve(len(r) * (1.0 + 1e-9) * np.eye(3) - r.T @ r, feet)
+        return np.linalg.solve(len(r) * (1.0 + 1e-9) * np.eye(3) - r.T @ r, feet)
+
+    @cached_property
+    def _central_moment(self) -> Array:
+        """Moments (N, 3) of the rays, moved so that all pass through the viewpoint, metres."""
+        x, y, z = self._viewpoint.tolist()
+        rx, ry, rz = self.rays.direction.T
+        return np.array([y * rz - z * ry, z * rx - x * rz, x * ry - y * rx]).T
+
+    @cached_property
+    def _nearest(self) -> Array:
+        """How far along each ray (N,) from its foot its line must be at least, metres.
+
+        Not in the mirror: that is, some times further from the viewpoint than the rays miss it.
+        """
+        miss = self.rays.moment - self._central_moment
+        radius = math.sqrt(float((miss * miss).sum()) / len(miss))
+        return self.rays.direction @ self._viewpoint + _CLEAR * radius
+
+    def _lines_in_base(self, pose: Pose2) -> tuple[Array, Array]:
+        """Line of each ray in base_link: d' and mu', (3, N) both."""
+        moments = moments_about(np.array([pose.x, pose.y]), self.directions, self.moments)
+        rotation = pose.rotation
+        return (self.directions @ rotation)[self.index].T, (moments @ rotation)[self.index].T
+
+    def central_information(self, pose: Pose2) -> Array:
+        """Information (3, 3) of a central camera at the viewpoint that sees the same lines.
+
+        Its rays are ours, turned into the plane through the viewpoint and the line.
+        """
+        x, y, z = self._viewpoint.tolist()
+        d, mu = self._lines_in_base(pose)
+        normal = mu - np.array([y * d[2] - z * d[1], z * d[0] - x * d[2], x * d[1] - y * d[0]])
+        normal = normal / np.sqrt(np.maximum((normal * normal).sum(axis=0), 1e-30))
+        r = self.rays.direction.T
+        r = r - (r * normal).sum(axis=0) * normal
+        w = np.array([y * r[2] - z * r[1], z * r[0] - x * r[2], x * r[1] - y * r[0]])
+        jacobian = monomial_rows(
+            r.T, w.T, self.directions[self.index], self.moments[self.index],
+        ) @ monomials_jacobian(pose)
+        return (jacobian / self.variance(pose)[:, None]).T @ jacobian
 
     def in_front(self, pose: Pose2) -> float:
-        """Fraction of the rays that pass their line in front of the mirror, not behind it.
+        """Fraction of the rays that pass their line in front of the mirror.
 
-        S is also zero where a ray prolonged backwards meets the line.
+        S is also zero where a ray prolonged backwards meets the line, and next to zero for all
+        rays at once where the line goes through the mirror itself.
         """
-        rotation = pose.rotation
-        d = (self.directions @ rotation)[self.index].T
-        mu = moments_about(np.array([pose.x, pose.y]), self.directions, self.moments) @ rotation
+        d, mu = self._lines_in_base(pose)
         r, w = self.rays.direction.T, self.rays.moment.T
         normal = (
             r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0])
         cosine = r[0] * d[0] + r[1] * d[1] + r[2] * d[2]
         # The ray's point nearest to the line lies at along / |r x d|^2 from its foot.
-        along = sum(n * (m - cosine * v) for n, m, v in zip(normal, mu[self.index].T, w))
-        return float(np.mean(along > self._viewpoint * (1.0 - cosine * cosine)))
+        along = sum(n * (m - cosine * v) for n, m, v in zip(normal, mu, w))
+        return float(np.mean(along > self._nearest * (1.0 - cosine * cosine)))
 
 
 def moments_about(origin: Array, directions: Array, moments: Array) -> Array:
