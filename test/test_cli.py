@@ -153,14 +153,18 @@ def black_bag(path: Path, size: tuple[int, int] = (720, 960)) -> Path:
         for i in range(3):
             writer.write_image(10**9 * (1 + i), np.zeros((*size, 3), np.uint8), compression='png')
             writer.write_odometry(10**9 * (1 + i), Pose2(0.1 * i, 0.0, 0.0))
+            writer.write_truth(10**9 * (1 + i), Pose2(0.1 * i, 0.0, 0.0))
     return path
 
 
 def test_a_bag_in_which_no_frame_is_answered_ends_with_1(tmp_path: Path, capsys: Capture) -> None:
     bag = black_bag(tmp_path / 'bag')
-    code, out, _ = said(
-        capsys, ['replay', str(bag), *ROOM, '--output', str(tmp_path / 'poses.tum')])
+    code, out, _ = said(capsys, [
+        'replay', str(bag), *ROOM, '--output', str(tmp_path / 'poses.tum'),
+        '--plots', str(tmp_path / 'plots')])
     assert code == 1
+    assert '0 of 3 frames answered' in out
+    assert len(list((tmp_path / 'plots').iterdir())) == 6
     assert len(read_tum(tmp_path / 'poses.tum')) == 0
     rows = [json.loads(line) for line in (tmp_path / 'poses.frames.jsonl').open()]
     assert len(rows) == 3

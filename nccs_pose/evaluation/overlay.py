@@ -58,7 +58,7 @@ def draw_overlay(
         for pixel, label in zip(
             _fixed(estimate.points.pixels, scale).tolist(), estimate.points.label,
         ):
-            cv2.circle(canvas, pixel, int(1.6 * 2**_SHIFT), _colour(int(label)), -1,
+            cv2.circle(canvas, tuple(pixel), int(1.6 * 2**_SHIFT), _colour(int(label)), -1,
                        cv2.LINE_AA, _SHIFT)
     if estimate.pose is not None:
         _draw_prediction(canvas, rig, line_map, estimate.pose, scale)

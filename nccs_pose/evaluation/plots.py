@@ -87,7 +87,7 @@ def error_figure(
         if covariance is not None and len(errors):
             band = 2.0 * factor * np.sqrt(covariance[:, k, k])
             axes.fill_between(time, -band, band, color=BAND, alpha=0.5, linewidth=0,
-                              label=r'$\pm 2\sigma$')
+                              label='±2σ')
             _limit(axes, values, band)
         axes.axhline(0.0, color='#888888', linewidth=0.8)
         axes.plot(time, values, '.-', color=ESTIMATED, linewidth=0.9, markersize=5,
