@@ -26,14 +26,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.observations import Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.sensitivity import IncidentRays, side_sensitivity
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array
+import numpy as np
+from numpy.typing import NDArray
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385

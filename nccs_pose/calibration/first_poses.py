@@ -24,9 +24,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.global_pose import solve
@@ -36,6 +33,8 @@ from nccs_pose.estimation.residual import lines_in_base, side_gradient
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays, Rig
+import numpy as np
+from numpy.typing import NDArray
 
 _HEADINGS = 36
 _REFINED = 4  # best headings that are refined and judged again

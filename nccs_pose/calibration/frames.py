@@ -24,15 +24,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.adjustment import ArrowSystem, posterior, Problem
 from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
+from numpy.typing import NDArray
 
 _GRID = 5  # places each way
 _HEADINGS = 6

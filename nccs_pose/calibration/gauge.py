@@ -23,10 +23,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from nccs_pose.calibration.parameters import Parameter, RigModel, RigParameters
 from nccs_pose.geometry.pose import Array
+import numpy as np
 
 _HELD = 1.0  # the data know less than the rough value
 _WEAK = 100.0  # the data know less than ten times as much as the rough value
@@ -108,7 +107,7 @@ def gauges(parameters: RigParameters, model: RigModel) -> list[tuple[str, Array]
                       "mirror's axis)", _moves(parameters, [
                           {'cop_x': -rig.cop[1], 'camera_z': 1.0}])))
     if rig.mirror.kind == 'sphere' and {'tilt_x', 'tilt_y'} <= parameters.index.keys():
-        arm = rig.cop + [0.0, 0.0, 0.5 * rig.mirror.B]
+        arm = rig.cop + np.array([0.0, 0.0, 0.5 * rig.mirror.B])
         moves = []
         for axis in np.eye(3)[:2]:
             shift = np.cross(axis, arm)

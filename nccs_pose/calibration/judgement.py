@@ -18,14 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.calibration.sensitivity import EdgeLines
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.refine import refine
 from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
 
 
 @dataclass(frozen=True, eq=False)

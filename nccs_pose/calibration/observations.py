@@ -18,14 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from itertools import pairwise
 
 from nccs_pose.errors import CalibrationError
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.line_points import LinePoints
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class Observations:
     def slices(self) -> list[slice]:
         """The rows of each frame."""
         ends = np.searchsorted(self.frame, np.arange(self.frames + 1))
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:])]
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def chosen(self, frames: Sequence[int] | NDArray[np.intp]) -> Observations:
         """The observations of some frames, in that order."""

@@ -20,16 +20,14 @@ that moves in the plane cannot see where on it the mirror sits, only that base_l
 
 A rig file has its centre of projection at x = 0, by the choice of the mirror frame. Here it may
 leave that plane, as a camera that is pushed sideways does; :meth:`RigParameters.model` then turns
-the mirror frame about its axis until x is 0 again. Whether the camera was pushed sideways or turned
-about the axis the lines cannot tell: together they turn base_link.
+the mirror frame about its axis until x is 0 again. Whether the camera was pushed sideways or
+turned about the axis the lines cannot tell: together they turn base_link.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.sensitivity import Sensitivity
@@ -38,6 +36,7 @@ from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import Array, RigidTransform, rotation_exp
 from nccs_pose.geometry.rig import Rig
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -121,11 +120,11 @@ class RigParameters:
             @ rough.R_mirror_camera,
             RigidTransform(
                 tilt @ mounting.rotation @ azimuth.T,
-                mounting.translation + [0.0, 0.0, self._part(theta, 'height')[0]]))
+                mounting.translation + np.array([0.0, 0.0, self._part(theta, 'height')[0]])))
         return RigModel(rig, self._map(theta))
 
     def _azimuth(self, theta: Array) -> Array:
-        """The turn (3, 3) about the mirror's axis that brings the centre of projection to x = 0."""
+        """The turn (3, 3) about the mirror's axis that brings the camera to x = 0."""
         x, y, _ = self._bare.cop + self._part(theta, 'cop_x', 'cop_y', 'cop_z')
         return rotation_exp([0.0, 0.0, np.arctan2(x if y >= 0.0 else -x, abs(y))])
 
@@ -219,15 +218,17 @@ def _parameters(
 ) -> list[Parameter]:
     cop, camera = 'centre of projection', 'camera against mirror'
     out = [
-        Parameter('cop_x', 'centre of projection sideways (x)', 'm', options.rough_cop_sideways,
-                  cop),
-        Parameter('cop_y', 'centre of projection across the axis (y)', 'm', options.rough_cop, cop),
-        Parameter('cop_z', 'centre of projection along the axis (z)', 'm', options.rough_cop, cop)]
+        Parameter(f'cop_{axis}', f'centre of projection {word} ({axis})', 'm', spread, cop)
+        for axis, word, spread in (
+            ('x', 'sideways', options.rough_cop_sideways),
+            ('y', 'across the axis', options.rough_cop),
+            ('z', 'along the axis', options.rough_cop))]
     out += [
         Parameter(f'camera_{axis}', f"camera's turn about the mirror's {axis}", 'rad',
                   options.rough_camera_tilt, camera) for axis in 'xyz']
     if options.height:
-        out.append(Parameter('height', 'height of the mirror', 'm', options.rough_height, 'height'))
+        out.append(Parameter(
+            'height', 'height of the mirror', 'm', options.rough_height, 'height'))
     if options.tilt:
         out += [
             Parameter(f'tilt_{axis}', f'{word} of the rig', 'rad', options.rough_tilt,

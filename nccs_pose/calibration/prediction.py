@@ -16,13 +16,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.vision.line_points import LinePoints
+import numpy as np
 
 
 def predict_frame(

@@ -19,9 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.adjustment import adjust, Adjustment
 from nccs_pose.calibration.first_poses import first_poses
 from nccs_pose.calibration.frames import advice, choose, frame_information, Terrain
@@ -40,6 +37,8 @@ from nccs_pose.errors import CalibrationError
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
+import numpy as np
+from numpy.typing import NDArray
 
 _LEAST_LINES = 2
 _START_FRAMES = 12

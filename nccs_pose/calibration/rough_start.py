@@ -24,15 +24,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.adjustment import adjust, Adjustment
 from nccs_pose.calibration.first_poses import first_poses
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array, wrap_angle
+import numpy as np
+from numpy.typing import NDArray
 
 _ROUNDS = 6
 _GOOD_FRAME = 0.85  # fraction of a frame's points that must be inliers

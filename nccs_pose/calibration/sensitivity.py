@@ -30,14 +30,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.calibration.observations import Observations
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
+import numpy as np
+from numpy.typing import NDArray
 
 _TINY = 1e-12  # metres per pixel: below this a pixel does not tell where the line is
 
@@ -172,7 +171,7 @@ class EdgeLines:
         self.moment = np.cross(self.middle, self.direction)
 
     def derivatives(self, r: Array, m: Array) -> tuple[Array, Array, Array]:
-        """dS by the tape's width, the line's offset and its turn (N,) each."""
+        """Derivatives of S by the tape's width, the line's offset and its turn (N,) each."""
         offset = _dot(r, np.cross(self.left, self.direction))
         # d <- d + phi left about the middle (the edge turns about the tape's own middle, which
         # differs from its own by half a width along d, a shift that a line does not feel).
