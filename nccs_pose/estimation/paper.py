@@ -25,8 +25,10 @@ of degree 4 (47 monomials, eq. 19). The problem (eq. 21) is
 
 solved by SLSQP with analytic gradients in the place of MATLAB's fmincon, from a first guess; the
 inverse transform at the end (eq. 22) gives T_map_base. What the print leaves open: g_2 is summed
-over the points, and only the overall scale of gamma_r is normalised (to 1 at the start), which
-moves no minimum. With noise g_2 = 0 has no solution, hence the option to leave it out.
+over the points, and the overall scale of gamma_r is set to 1 at the start, which moves no minimum.
+With noise g_2 = 0 has no solution, hence the option to leave it out. As printed, the points weigh
+by the sizes of their polynomials, which differ by orders of magnitude over a mirror; dividing each
+by the norm of its coefficients, which the paper does not do, is the other option.
 
 The paper's motion is parallel to the mirror's xy-plane. A rig whose mirror is tilted against
 base_link is therefore treated as if it hung straight: the tilt is dropped, and costs roughly
@@ -120,7 +122,7 @@ class PaperFrame:
         """T_map_base of (c, s, t_x, t_y), by the paper's inverse transform (eq. 22)."""
         c, s, t_x, t_y = parameters
         theta = math.atan2(s, c)
-        moved = np.array([t_x, t_y, 0.0]) + [self.mounting[0], self.mounting[1], 0.0]
+        moved = np.array([t_x + self.mounting[0], t_y + self.mounting[1], 0.0])
         x, y, _ = self.turn.T @ (-_about_z(theta).T @ moved)
         return Pose2(x, y, self.sense * theta)
 
@@ -137,9 +139,13 @@ class PaperProblem:
     :param points: mirror points (M, 3) in the mirror frame, metres.
     :param directions: unit directions of the lines in the map (M, 3).
     :param moments: their moments (M, 3), metres.
+    :param normalised: divide each point's gamma_r by the size of its coefficients.
     """
 
-    def __init__(self, rig: Rig, points: Array, directions: Array, moments: Array) -> None:
+    def __init__(
+        self, rig: Rig, points: Array, directions: Array, moments: Array, *,
+        normalised: bool = False,
+    ) -> None:
         self.frame = PaperFrame.of_rig(rig)
         self.x = points[:, 0]
         _, y, z = points.T
@@ -164,6 +170,9 @@ class PaperProblem:
             on_mu * (-mu_y - t_z * d_x) + on_d_y * d_x,
             on_mu * d_z,
             -n * o_y * d_z + zero], axis=1)
+        if normalised:
+            squares = (self.p_rows**2).sum(axis=1) + np.abs(w) * (self.q_rows**2).sum(axis=1)
+            self.E = 1.0 / np.sqrt(np.maximum(squares, 1e-300))
 
     def _p_and_q(self, parameters: Array) -> tuple[Array, Array, Array, Array]:
         """P and Q (M,), and their gradients (M, 4)."""
@@ -202,6 +211,7 @@ def paper_estimate(
     start: Pose2,
     *,
     use_g2: bool = True,
+    normalised: bool = False,
     max_iterations: int = 100,
 ) -> PaperEstimate:
     """The pose by the paper's problem (eq. 21).
@@ -211,6 +221,7 @@ def paper_estimate(
     :param moments: their moments (M, 3), metres.
     :param start: first guess of T_map_base; the paper takes the previous frame's pose.
     :param use_g2: whether to demand g_2 = 0.
+    :param normalised: divide each point's gamma_r by the size of its coefficients.
     :raises EstimationError: with fewer than three pixels, with a pixel that misses the mirror, or
         for values that are not finite.
     """
@@ -228,7 +239,7 @@ def paper_estimate(
     points, hit = rig.mirror_points(pixels)
     if not hit.all():
         raise EstimationError(f'{int((~hit).sum())} of {len(pixels)} pixels miss the mirror')
-    problem = PaperProblem(rig, points, directions, moments)
+    problem = PaperProblem(rig, points, directions, moments, normalised=normalised)
     return _solve(problem, start, use_g2, max_iterations)
 
 

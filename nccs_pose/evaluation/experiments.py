@@ -1,0 +1,220 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The paper's synthetic experiments, and the questions that it leaves: cells, runs, tables.
+
+A run writes the CSV of every trial, a figure and a Markdown summary into one folder. Trials are
+spread over processes by joblib; a trial's random numbers come from its seed, cell and number, so
+the CSV is the same, byte by byte, whatever the number of workers.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import csv
+import dataclasses
+from dataclasses import dataclass
+import io
+import os
+from pathlib import Path
+import sys
+
+from joblib import delayed, Parallel
+from nccs_pose.errors import OptionError
+from nccs_pose.evaluation.experiment_options import ExperimentOptions
+from nccs_pose.evaluation.experiment_plots import box_figure, projection_figure
+from nccs_pose.evaluation.experiment_summary import summary_text
+from nccs_pose.evaluation.line_projection import project_lines, projection_summary
+from nccs_pose.evaluation.trials import Answer, Cell, run_trial
+from nccs_pose.simulation.table_one import TABLE_ONE
+
+LINE_PROJECTION = 'line-projection'
+_PIXEL_LEVELS = tuple(range(11))  # px
+_WORLD_LEVELS = tuple(range(11))  # cm
+_LINE_LEVELS = (4, 6, 8, 10, 15, 20)
+_BLIND_POINTS = {4: 75, 5: 20}  # four lines on the floor, five in space
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One figure of the paper, or a question of our own.
+
+    :ivar title: of the figure and the summary.
+    :ivar axis: label of the figure's x-axis.
+    :ivar lines: lines per trial, where the options do not say; 0: the level is their number.
+    :ivar points: points per line, where the options do not say; 0: it goes with the level.
+    :ivar levels: places on the x-axis.
+    :ivar noise: (sigma_px, sigma_world in metres) of a level.
+    """
+
+    title: str
+    axis: str
+    lines: int
+    points: int
+    levels: tuple[int, ...]
+    noise: Callable[[int], tuple[float, float]]
+
+
+EXPERIMENTS = {
+    'pixel-noise': Experiment(
+        'Noise on the pixels (the figure with noisy image pixels)', 'σ of the pixels (px)', 5, 20,
+        _PIXEL_LEVELS, lambda level: (float(level), 0.0)),
+    'world-noise': Experiment(
+        'Noise on the world points (the figure with noisy world points)',
+        'σ of the points (cm)', 10, 20, _WORLD_LEVELS, lambda level: (0.0, 0.01 * level)),
+    'line-count': Experiment(
+        'Number of lines, at 5 cm of noise on the world points', 'lines', 0, 20, _LINE_LEVELS,
+        lambda level: (0.0, 0.05)),
+    'no-guess': Experiment(
+        'No initial guess, at 1 px: 4 floor lines × 75 points, 5 lines in space × 20',
+        'lines', 0, 0, tuple(_BLIND_POINTS), lambda level: (1.0, 0.0)),
+}
+NAMES = (LINE_PROJECTION, *EXPERIMENTS)
+
+
+def cells_of(name: str, options: ExperimentOptions) -> tuple[Cell, ...]:
+    """The boxes of an experiment's figure, mirror by mirror, level by level."""
+    experiment, cells = EXPERIMENTS[name], []
+    for m, mirror in enumerate(TABLE_ONE):
+        for level in experiment.levels:
+            lines = (options.lines or experiment.lines) if experiment.lines else level
+            points = options.points or experiment.points or _BLIND_POINTS[level]
+            sigma_px, sigma_world = experiment.noise(level)
+            cells.append(Cell(
+                mirror, float(level), lines, points, sigma_px, sigma_world,
+                on_floor=name == 'no-guess' and level == 4, blind=name == 'no-guess',
+                key=(list(EXPERIMENTS).index(name), m, level)))
+    return tuple(cells)
+
+
+def run_experiment(
+    name: str,
+    trials: int,
+    output: Path,
+    *,
+    workers: int = 1,
+    backend: str = 'loky',
+    options: ExperimentOptions | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> str:
+    """Run one experiment and write its CSV, figure and summary.
+
+    :param name: one of NAMES.
+    :param trials: trials per cell; for line-projection, scenes per mirror.
+    :param output: folder for NAME.csv, NAME.png and NAME.md; made where it does not exist.
+    :param workers: processes.
+    :param backend: of joblib: loky on one machine, or one that a cluster registers (dask, ray).
+    :param progress: called with one line of text after each cell.
+    :returns: the summary.
+    :raises OptionError: for an unknown name or a number of trials or workers below 1.
+    """
+    options = options or ExperimentOptions()
+    if name not in NAMES:
+        raise OptionError(f'experiment {name!r}: must be one of {", ".join(NAMES)}')
+    for key, value in (('trials', trials), ('workers', workers)):
+        if value < 1:
+            raise OptionError(f'{key} = {value}: must be at least 1')
+    output.mkdir(parents=True, exist_ok=True)
+    if name == LINE_PROJECTION:
+        scenes = [project_lines(options, mirror, trials) for mirror in TABLE_ONE]
+        rows, figure = [row for s in scenes for row in s.rows], projection_figure(scenes)
+        summary = projection_summary(scenes, options)
+        header = scenes[0].header
+    else:
+        results = _run_cells(name, trials, workers, backend, options, progress)
+        rows = [
+            row for cell, answers in results for i, trial in enumerate(answers)
+            for row in _rows(name, options, cell, i, trial)]
+        header = _HEADER
+        figure = box_figure(EXPERIMENTS[name].title, EXPERIMENTS[name].axis, results)
+        summary = summary_text(name, EXPERIMENTS[name].title, trials, options, results)
+    (output / f'{name}.csv').write_text(_csv(header, rows), encoding='utf-8')
+    (output / f'{name}.md').write_text(summary, encoding='utf-8')
+    figure.savefig(output / f'{name}.png', dpi=110)
+    return summary
+
+
+def _run_cells(
+    name: str, trials: int, workers: int, backend: str, options: ExperimentOptions,
+    progress: Callable[[str], None],
+) -> list[tuple[Cell, list[tuple[Answer, ...]]]]:
+    cells, results = cells_of(name, options), []
+    with Parallel(n_jobs=workers, backend=backend if workers > 1 else 'sequential') as pool:
+        for i, cell in enumerate(cells):
+            answers = pool(delayed(run_trial)(options, cell, trial) for trial in range(trials))
+            results.append((cell, list(answers)))
+            progress(f'{name}: {i + 1} of {len(cells)} cells ({cell.mirror}, {cell.level:g})')
+    return results
+
+
+_HEADER = (
+    'experiment', 'mirror', 'level', 'lines', 'points', 'sigma_px', 'sigma_world_m', 'trial',
+    'estimator', 'error_x_m', 'error_y_m', 'error_yaw_rad', 'rotation_deg', 'translation_m',
+    'nees', 'failed')
+
+
+def _rows(
+    name: str, options: ExperimentOptions, cell: Cell, trial: int, answers: tuple[Answer, ...],
+) -> list[tuple[object, ...]]:
+    rows = []
+    for answer in answers:
+        error = ('', '', '') if answer.error is None else tuple(f'{v:.9g}' for v in answer.error)
+        absent = answer.error is None
+        rows.append((
+            name, cell.mirror, f'{cell.level:g}', cell.lines, cell.points, f'{cell.sigma_px:g}',
+            f'{cell.sigma_world:g}', trial, answer.estimator, *error,
+            '' if absent else f'{answer.rotation_deg:.9g}',
+            '' if absent else f'{answer.translation:.9g}',
+            '' if answer.nees is None else f'{answer.nees:.9g}',
+            int(answer.failed(options))))
+    return rows
+
+
+def _csv(header: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Flags of ``nccs-pose experiment``."""
+    parser.add_argument('name', choices=NAMES, help='which experiment')
+    parser.add_argument('--trials', type=int, default=100, help='trials per cell (paper: 1000)')
+    parser.add_argument('--output', type=Path, required=True, help='folder for what it writes')
+    parser.add_argument(
+        '--workers', type=int, default=os.cpu_count() or 1, help='processes (all cores)')
+    parser.add_argument(
+        '--backend', default='loky', help="joblib's backend; one of a cluster's works too")
+    for field in dataclasses.fields(ExperimentOptions):
+        flag = '--' + field.name.replace('_', '-')
+        unit = f' [{field.metadata["unit"]}]' if field.metadata['unit'] else ''
+        text = f'{field.metadata["doc"]}{unit} (default {field.default})'
+        if isinstance(field.default, bool):
+            parser.add_argument(flag, action='store_true', help=text)
+        else:
+            parser.add_argument(flag, type=type(field.default), default=field.default, help=text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``nccs-pose experiment`` and print the summary."""
+    options = ExperimentOptions(**{
+        field.name: getattr(args, field.name) for field in dataclasses.fields(ExperimentOptions)})
+    summary = run_experiment(
+        args.name, args.trials, args.output, workers=args.workers, backend=args.backend,
+        options=options, progress=lambda text: print(text, file=sys.stderr, flush=True))
+    print(summary)
+    print(f'Written to {args.output}: {args.name}.csv, {args.name}.png, {args.name}.md')
+    return 0

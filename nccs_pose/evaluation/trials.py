@@ -1,0 +1,237 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""One trial of the paper's synthetic experiments: a data set, and four answers to it.
+
+The data set follows the paper's section IV-A: random lines in space that the camera sees, a random
+true pose, M points of each line projected through the mirror, Gaussian noise on the pixels or on
+the points. The answers are the paper's estimator with and without g_2, from a start near the
+truth, ours from no start at all, and a draw from the Cramér-Rao bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+import math
+
+from nccs_pose.errors import EstimationError, SimulationError
+from nccs_pose.estimation.bound import cramer_rao_bound
+from nccs_pose.estimation.global_pose import solve
+from nccs_pose.estimation.paper import paper_estimate
+from nccs_pose.estimation.refine import refine
+from nccs_pose.evaluation.experiment_options import ExperimentOptions
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.rig import Rig
+import numpy as np
+from numpy.typing import NDArray
+
+# Noise that the estimator is told of when there is none: any positive number would do.
+_NO_NOISE_PX = 1e-3
+_TRIES = 200
+_REACH = 4.0  # m: the true position lies within this of the map's origin, in x and in y
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One box of a figure: the setting that its trials share.
+
+    :ivar mirror: name in Table I.
+    :ivar level: number on the figure's x-axis.
+    :ivar lines: lines per trial.
+    :ivar points: points per line.
+    :ivar sigma_px: noise of the pixels, px.
+    :ivar sigma_world: noise of the points in the world, metres.
+    :ivar on_floor: lines on the ground instead of anywhere in space.
+    :ivar blind: the paper's estimator starts anywhere.
+    :ivar key: what the random numbers depend on, beside seed and trial.
+    """
+
+    mirror: str
+    level: float
+    lines: int
+    points: int
+    sigma_px: float = 0.0
+    sigma_world: float = 0.0
+    on_floor: bool = False
+    blind: bool = False
+    key: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class DataSet:
+    """What one trial's estimators are given, and the truth.
+
+    :ivar pixels: noisy pixels (M, 2).
+    :ivar clean: the same pixels without noise (M, 2).
+    :ivar directions: unit directions of the lines in the map (L, 3).
+    :ivar moments: their moments (L, 3), metres.
+    :ivar label: line of each pixel (M,).
+    :ivar truth: T_map_base.
+    :ivar start: first guess of the paper's estimator.
+    """
+
+    pixels: Array
+    clean: Array
+    directions: Array
+    moments: Array
+    label: NDArray[np.intp]
+    truth: Pose2
+    start: Pose2
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One estimator's answer to one trial.
+
+    :ivar error: (x, y, yaw) estimated minus true; None where there is no estimate.
+    :ivar nees: squared error in units of the bound; None without noise or estimate.
+    """
+
+    estimator: str
+    error: tuple[float, float, float] | None
+    nees: float | None
+
+    @property
+    def rotation_deg(self) -> float:
+        """Absolute rotation error in degrees; infinite where there is no estimate."""
+        return math.inf if self.error is None else math.degrees(abs(self.error[2]))
+
+    @property
+    def translation(self) -> float:
+        """Norm of the translation error in metres; infinite where there is no estimate."""
+        return math.inf if self.error is None else math.hypot(*self.error[:2])
+
+    def failed(self, options: ExperimentOptions) -> bool:
+        """Whether it is farther off than the limits of a failure, or not there."""
+        return (
+            self.rotation_deg > options.failure_angle
+            or self.translation > options.failure_distance)
+
+
+@lru_cache(maxsize=16)
+def _rig(options: ExperimentOptions, name: str) -> Rig:
+    return options.rig(name)
+
+
+def run_trial(options: ExperimentOptions, cell: Cell, trial: int) -> tuple[Answer, ...]:
+    """All estimators on one data set, as `options.estimators` orders them.
+
+    The numbers depend on the options, the cell and the trial only, not on what ran before.
+    """
+    rng = np.random.default_rng(
+        np.random.SeedSequence(options.seed, spawn_key=(*cell.key, trial)))
+    rig = _rig(options, cell.mirror)
+    data = make_data_set(rig, options, cell, rng)
+    d, mu = data.directions[data.label], data.moments[data.label]
+    noisy = cell.sigma_px > 0.0 or cell.sigma_world > 0.0
+    bound = None
+    if noisy:
+        bound = cramer_rao_bound(
+            rig.back_project(data.clean), d, mu, data.truth,
+            sigma=cell.sigma_px or _NO_NOISE_PX, sigma_world=cell.sigma_world)
+    draw = np.zeros(3) if bound is None else np.linalg.cholesky(bound) @ rng.normal(size=3)
+    ways: dict[str, Callable[[], Pose2 | None]] = {
+        'paper': lambda: paper_estimate(
+            rig, data.pixels, d, mu, data.start, normalised=options.normalised).pose,
+        'paper without g2': lambda: paper_estimate(
+            rig, data.pixels, d, mu, data.start, use_g2=False,
+            normalised=options.normalised).pose,
+        'ours': lambda: our_estimate(rig, data, cell),
+        'bound': lambda: Pose2.from_array(data.truth.as_array() + draw),
+    }
+    return tuple(_answer(name, ways[name](), data.truth, bound) for name in options.estimators)
+
+
+def our_estimate(rig: Rig, data: DataSet, cell: Cell) -> Pose2 | None:
+    """Closed form without a start, then the robust refinement in pixels."""
+    rays = rig.back_project(data.pixels)
+    noise = {'sigma': cell.sigma_px or _NO_NOISE_PX, 'sigma_world': cell.sigma_world}
+    try:
+        first = solve(rays, data.directions, data.moments, data.label, **noise)[0].pose
+        return refine(
+            rays, data.directions[data.label], data.moments[data.label], first, **noise).pose
+    except EstimationError:
+        return None
+
+
+def _answer(name: str, pose: Pose2 | None, truth: Pose2, bound: Array | None) -> Answer:
+    if pose is None:
+        return Answer(name, None, None)
+    error = pose.as_array() - truth.as_array()
+    error[2] = wrap_angle(error[2])
+    nees = None if bound is None else float(error @ np.linalg.solve(bound, error))
+    x, y, yaw = error.tolist()
+    return Answer(name, (x, y, yaw), nees)
+
+
+def make_data_set(
+    rig: Rig, options: ExperimentOptions, cell: Cell, rng: np.random.Generator,
+) -> DataSet:
+    """Random lines, a random pose, noisy pixels.
+
+    :raises SimulationError: if the rig hardly sees any line of this range.
+    """
+    truth = Pose2(*rng.uniform(-_REACH, _REACH, 2), rng.uniform(-math.pi, math.pi))
+    # a uniform direction and distance, so that the start is anywhere in the disc
+    angle, distance = rng.uniform(-math.pi, math.pi), math.sqrt(rng.uniform())
+    reach, turn = (3.0, 180.0) if cell.blind else (options.start_distance, options.start_angle)
+    start = Pose2(
+        truth.x + reach * distance * math.cos(angle), truth.y + reach * distance * math.sin(angle),
+        truth.yaw + math.radians(turn) * rng.uniform(-1.0, 1.0))
+    points, directions = [], []
+    for _ in range(_TRIES * cell.lines):
+        found = _points_of_a_line(rig, options, cell, rng)
+        if found is not None:
+            points.append(found[0])
+            directions.append(found[1])
+        if len(points) == cell.lines:
+            break
+    else:
+        raise SimulationError(
+            f'mirror {cell.mirror!r} sees hardly any line with {cell.points} points between '
+            f'nearest = {options.nearest} m and farthest = {options.farthest} m')
+    in_base = np.concatenate(points)
+    label = np.repeat(np.arange(cell.lines), cell.points)
+    d = np.array(directions) @ truth.rotation.T
+    mu = np.cross(truth.apply(np.array([p[0] for p in points])), d)
+    clean, _ = rig.project(in_base)
+    moved = in_base + rng.normal(size=in_base.shape) * cell.sigma_world
+    pixels, seen = rig.project(moved)
+    pixels = pixels + rng.normal(size=pixels.shape) * cell.sigma_px
+    # a noisy pixel beside the mirror, or a point that noise hides, is no measurement
+    seen &= rig.mirror_points(pixels)[1]
+    return DataSet(pixels[seen], clean[seen], d, mu, label[seen], truth, start)
+
+
+def _points_of_a_line(
+    rig: Rig, options: ExperimentOptions, cell: Cell, rng: np.random.Generator,
+) -> tuple[Array, Array] | None:
+    """Points (K, 3) of a random line, all seen, and its direction (3,), in base_link."""
+    mirror = rig.T_base_mirror.translation
+    q, d = rng.normal(size=(2, 3))
+    if cell.on_floor:
+        q[2] = d[2] = 0.0
+        below = np.array([mirror[0], mirror[1], 0.0])
+        q = below + q * rng.uniform(options.nearest, options.farthest) / np.linalg.norm(q)
+    else:
+        q = mirror + q * rng.uniform(options.nearest, options.farthest) / np.linalg.norm(q)
+    d /= np.linalg.norm(d)
+    along = options.length * rng.uniform(-0.5, 0.5, 4 * cell.points + 20)
+    points = q + along[:, None] * d
+    distance = np.linalg.norm(points - mirror, axis=1)
+    points = points[(distance >= options.nearest) & (distance <= options.farthest)]
+    _, seen = rig.project(points)
+    points = points[seen]
+    return None if len(points) < cell.points else (points[:cell.points], d)
