@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import math
 
-from labelled_scene import pose_error, random_scene
+from hypothesis import given
+from hypothesis import strategies as st
+from labelled_scene import pose_error, random_direction, random_scene
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.general_lines import general_minima
 from nccs_pose.estimation.global_pose import solve
@@ -208,3 +210,27 @@ def test_rays_that_point_away_are_refused(kinds):
     else:
         with pytest.raises(EstimationError, match='behind the mirror'):
             solve(reversed_, scene.directions, scene.moments, scene.label)
+
+
+@given(
+    st.lists(st.sampled_from(['floor', 'vertical', 'slanted']), min_size=1, max_size=4),
+    st.integers(3, 12), st.integers(0, 1000), st.booleans())
+def test_nonsense_gives_a_finite_pose_or_a_refusal(kinds, count, seed, same_pixel):
+    """Pixels that show none of the lines, all in one place or anywhere."""
+    rng = np.random.default_rng(seed)
+    rig = TABLE_ONE['hyperbolic']
+    pixels = rng.uniform([300.0, 100.0], [900.0, 700.0], (count, 2))
+    if same_pixel:
+        pixels[:] = pixels[0]
+    directions = np.array([random_direction(kind, rng) for kind in kinds])
+    moments = np.cross(rng.uniform(-3.0, 3.0, (len(kinds), 3)), directions)
+    label = rng.integers(0, len(kinds), count)
+    try:
+        found = solve(rig.back_project(pixels), directions, moments, label)
+    except EstimationError:
+        return
+    assert found
+    for solution in found:
+        assert math.isfinite(solution.chi2) and np.isfinite(solution.information).all()
+        if solution.covariance is not None:
+            assert np.linalg.eigvalsh(solution.covariance).min() > 0.0

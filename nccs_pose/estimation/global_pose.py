@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.general_lines import all_minima
+from nccs_pose.estimation.general_lines import ALIGNED, all_minima
 from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.observability import (
     Symmetry,
@@ -61,9 +61,9 @@ class Solution:
     :ivar chi2: sum of squared whitened residuals.
     :ivar information: of (x, y, yaw) at the pose (3, 3), with the noise as told.
     :ivar covariance: its inverse; None with an unobserved direction.
-    :ivar unobserved: directions that a central camera in the place of this one would not fix,
-        worst first. What the little distance between the rays tells of them changes so fast
-        along the way that the information at one pose is no measure of it.
+    :ivar unobserved: directions that are not fixed, worst first, or that a central camera in the
+        place of this one would not fix: what the little distance between the rays tells of them
+        changes so fast along the way that the information at one pose is no measure of it.
     :ivar symmetry: of the lines that have rays.
     """
 
@@ -191,7 +191,11 @@ def _difference(a: float, b: float) -> float:
 def _solution(data: LabelledRays, found: _Found, lines: Symmetry) -> Solution:
     x, y = (found.pose.x + data.origin[0], found.pose.y + data.origin[1])
     pose = Pose2(x, y, found.pose.yaw)
-    unobserved = unobserved_directions(data.central_information(found.pose), pose)
+    unobserved = unobserved_directions(found.information, pose)
+    # At a known height a central camera sees what ours does.
+    if not (np.abs(data.directions[:, 2]) <= ALIGNED).all():
+        central = unobserved_directions(data.central_information(found.pose), pose)
+        unobserved = max(unobserved, central, key=len)
     covariance = None
     if not unobserved:
         covariance = np.asarray(np.linalg.inv(found.information), dtype=float)
