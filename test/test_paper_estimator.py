@@ -18,10 +18,6 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations_with_replacement
 
-import numpy as np
-import pytest
-from scipy.optimize import approx_fprime
-
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.bound import cramer_rao_bound
 from nccs_pose.estimation.paper import (
@@ -36,6 +32,9 @@ from nccs_pose.geometry.pose import Pose2, RigidTransform
 from nccs_pose.geometry.reflection_curve import ReflectionCurve
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.table_one import TABLE_ONE
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
 
 POSE = Pose2(0.3, -0.2, 0.7)
 START = Pose2(0.36, -0.12, 0.78)
