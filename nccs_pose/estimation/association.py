@@ -56,13 +56,15 @@ class _FloorLines:
     normal: Array
     offset: Array
     length: Array
+    colour: tuple[str, ...]
 
     @classmethod
     def of(cls, line_map: LineMap) -> _FloorLines:
         start, direction = line_map.starts[:, :2], line_map.directions[:, :2]
         normal = np.column_stack([-direction[:, 1], direction[:, 0]])
         return cls(
-            start, direction, normal, np.einsum('li,li->l', normal, start), line_map.lengths)
+            start, direction, normal, np.einsum('li,li->l', normal, start), line_map.lengths,
+            tuple(line.colour for line in line_map))
 
 
 def global_candidates(
@@ -102,6 +104,8 @@ def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array
     map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
     a, b = (index.ravel() for index in np.indices((len(map_angle), len(map_angle))))
     between_lines = map_angle[a] - map_angle[b]
+    same_colour = {
+        s.colour: np.array([colour == s.colour for colour in lines.colour]) for s in segments}
     poses = []
     for i, first in enumerate(segments):
         for second in segments[i + 1:]:
@@ -110,7 +114,7 @@ def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array
             if abs(np.sin(between)) < np.sin(_CROSSING):
                 continue
             match = np.abs(np.sin(between_lines - between)) < np.sin(_ANGLE_GATE)
-            match &= a != b
+            match &= (a != b) & same_colour[first.colour][a] & same_colour[second.colour][b]
             for turn in (0.0, np.pi):
                 yaw_a = map_angle[a[match]] - angles[0] + turn
                 off = np.sin(2.0 * (map_angle[b[match]] - angles[1] - yaw_a)) / 2.0
@@ -149,6 +153,9 @@ class _Scorer:
     ) -> None:
         self._lines = lines
         self._table = table
+        # A strip of one colour lies on no line of another.
+        self._foreign = np.array([
+            np.repeat([s.colour != colour for s in segments], _SAMPLES) for colour in lines.colour])
         share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         starts = np.array([s.start for s in segments])
         ends = np.array([s.end for s in segments])
@@ -174,7 +181,8 @@ class _Scorer:
             across = lines.normal[k, 0] * x + lines.normal[k, 1] * y - lines.offset[k]
             along = (lines.direction[k, 0] * (x - lines.start[k, 0])
                      + lines.direction[k, 1] * (y - lines.start[k, 1]))
-            outside = (along < -_BEYOND) | (along > lines.length[k] + _BEYOND)
+            outside = ((along < -_BEYOND) | (along > lines.length[k] + _BEYOND)
+                       | self._foreign[k])
             distance = np.where(outside, np.inf, np.abs(across))
             closer = distance < best
             best = np.where(closer, distance, best)
@@ -194,7 +202,7 @@ class _Scorer:
         dx, dy = flat[:, 0] - poses[:, :1], flat[:, 1] - poses[:, 1:2]
         base = np.stack([c[:, None] * dx + s[:, None] * dy, -s[:, None] * dx + c[:, None] * dy], 2)
         pixels = self._table.pixels(base.reshape(-1, 2))
-        seen = _visible(self._table, pixels).reshape(h, -1)
+        seen = self._table.sees_floor(pixels).reshape(h, -1)
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
         image = pixels.reshape(h, len(self._lines.length), _SAMPLES, 2)
         step = np.linalg.norm(np.gradient(image, axis=2), axis=3).reshape(h, -1)
@@ -233,14 +241,6 @@ class _Scorer:
             pose = pose - np.linalg.solve(
                 normal_matrix, jacobian.T @ (error / self._tolerance[chosen]))
         return pose
-
-
-def _visible(table: FloorTable, pixels: Array) -> NDArray[np.bool_]:
-    height, width = table.region.shape
-    column = np.clip(np.rint(pixels[:, 0]), -1, width).astype(int)
-    row = np.clip(np.rint(pixels[:, 1]), -1, height).astype(int)
-    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    return inside & (table.region[row * inside, column * inside] > 0)
 
 
 def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:

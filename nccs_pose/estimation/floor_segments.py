@@ -51,6 +51,7 @@ class FloorSegment:
     :ivar weight: how many pixels it is made of.
     :ivar footprint: how far its pixels reach across it on the floor, metres (median).
     :ivar pixels: those pixels (M, 2), in the image.
+    :ivar colour: colour class.
     """
 
     normal: Array
@@ -60,6 +61,7 @@ class FloorSegment:
     weight: float
     footprint: float
     pixels: Array
+    colour: str = 'green'
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +80,12 @@ class _Points:
 
 
 def floor_segments(
-    segmentation: Segmentation, table: FloorTable, width: float, most: int = 16,
+    segmentation: Segmentation, table: FloorTable, width: float, colour: str, most: int = 16,
 ) -> tuple[FloorSegment, ...]:
     """Straight strips among the blobs, those of most pixels first.
 
     :param width: width of the tapes, metres.
+    :param colour: their colour class.
     :param most: at most so many.
     """
     if len(segmentation.pixels) == 0:
@@ -106,7 +109,8 @@ def floor_segments(
             continue
         normal, offset, inside, beside = found
         if beside < 0.5:
-            segments.append(_segment(points, segmentation.pixels, inside, normal, offset))
+            segments.append(_segment(
+                points, segmentation.pixels, inside, normal, offset, colour))
         free &= ~inside
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
@@ -203,6 +207,7 @@ def _longest_run(
 
 def _segment(
     points: _Points, pixels: Array, inside: NDArray[np.bool_], normal: Array, offset: float,
+    colour: str,
 ) -> FloorSegment:
     direction = np.array([-normal[1], normal[0]])
     along = points.floor[inside] @ direction
@@ -210,4 +215,4 @@ def _segment(
     return FloorSegment(
         normal, offset, offset * normal + along.min() * direction,
         offset * normal + along.max() * direction, float(points.weight[inside].sum()),
-        float(np.median(footprint)), pixels[inside])
+        float(np.median(footprint)), pixels[inside], colour)

@@ -46,15 +46,6 @@ def predict_bands(
     return _bands(table, line_map, pose, at[:, 0], at[:, 1], label)
 
 
-def in_view(table: FloorTable, pixels: Array) -> NDArray[np.bool_]:
-    """Whether pixels (N, 2) lie where the rig sees the floor within reach (N,)."""
-    height, width = table.region.shape
-    column = np.rint(pixels[:, 0]).astype(int)
-    row = np.rint(pixels[:, 1]).astype(int)
-    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    return inside & (table.region[row * inside, column * inside] > 0)
-
-
 def _place(
     table: FloorTable, line_map: LineMap, k: int, pose: Pose2, stations: int,
 ) -> Array:
@@ -66,7 +57,7 @@ def _place(
     points = line.start[:2] + distance[:, None] * line.direction[:2]
     pixels = table.pixels(pose.inverse().apply(points))
     step = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
-    visible = in_view(table, pixels)
+    visible = table.sees_floor(pixels)
     step = np.where(visible[1:] & visible[:-1], step, 0.0)
     arc = np.concatenate([[0.0], np.cumsum(step)])
     length = arc[-1] - 2.0 * _END
@@ -113,5 +104,5 @@ def _bands(
     reach = 0.5 * width * np.abs(lean)
     whole = (distance > reach) & (distance < line_map.lengths[label] - reach)
     centre = 0.5 * (edges[:n] + edges[n:])
-    keep = whole & in_view(table, centre) & (half_width > 1e-3)
+    keep = whole & table.sees_floor(centre) & (half_width > 1e-3)
     return Bands(centre, midline, across, along, bend, half_width, spacing, label)[keep]

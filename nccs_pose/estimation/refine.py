@@ -110,6 +110,7 @@ def refine(
     prior: tuple[Pose2, Array] | None = None,
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
     robust: bool = True,
+    noise_known: bool = True,
     max_iterations: int = 30,
 ) -> Refinement:
     """Minimise the whitened residuals of N rays against the N lines that they should meet.
@@ -126,6 +127,7 @@ def refine(
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held, the rest is estimated beside the pose.
     :param robust: False takes every pixel for an inlier.
+    :param noise_known: False takes ``sigma`` for relative and its scale from the residuals.
     :raises EstimationError: with fewer than three rays, or a ray that missed the mirror.
     """
     if len(rays) < 3:
@@ -148,7 +150,8 @@ def refine(
     # Residuals larger than the noise was told to be widen the claim; smaller ones do not
     # narrow it.
     degrees = max(1, int(inlier.sum()) - 3)
-    inflation = max(1.0, float(e[inlier] @ e[inlier]) / degrees)
+    inflation = float(e[inlier] @ e[inlier]) / degrees
+    inflation = max(1.0, inflation) if noise_known else max(1e-6, inflation)
     covariance = np.linalg.inv(normal / inflation + known)[:3, :3]
     attitude = unknowns[3:] if len(unknowns) == 6 else np.zeros(3)
     return Refinement(

@@ -15,7 +15,7 @@
 """The floor seen through the mirror, tabulated: ground points to pixels and back, quickly.
 
 The exact maps cost microseconds a point; tracking asks for thousands of points a frame. Both
-tables are made once per rig. The forward one is good to a few thousandths of a pixel; the
+tables are made once per rig. The forward one is good to a thousandth of a pixel; the
 backward one serves where a pixel's place on the floor need only be known roughly.
 """
 
@@ -55,7 +55,8 @@ class FloorTable:
         self._centre = rig.T_base_mirror.translation[:2]
         self._height = float(rig.T_base_mirror.translation[2])
         if self._height <= 0.0:
-            raise GeometryError(f'the mirror at height {self._height} m does not stand over a floor')
+            raise GeometryError(
+                f'the mirror at height {self._height} m does not stand over a floor')
         self._last_angle = math.atan2(1.02 * reach, self._height)
         self._splines = self._forward()
         self._grid, self._grid_reaches = self._backward()
@@ -126,6 +127,14 @@ class FloorTable:
                 & self._grid_reaches[:-1, 1:] & self._grid_reaches[1:, 1:])
         full = np.kron(cell.astype(np.uint8), np.full((_STRIDE, _STRIDE), 255, np.uint8))
         return np.ascontiguousarray(full[:camera.height, :camera.width])
+
+    def sees_floor(self, pixels: Array) -> NDArray[np.bool_]:
+        """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
+        height, width = self.region.shape
+        column = np.rint(np.clip(pixels[:, 0], -1.0, width)).astype(int)
+        row = np.rint(np.clip(pixels[:, 1], -1.0, height)).astype(int)
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        return inside & (self.region[row * inside, column * inside] > 0)
 
     def floor(self, pixels: Array) -> tuple[Array, Array]:
         """Ground points (N, 2) of pixels in :attr:`region`, and d(point)/d(u, v) (N, 2, 2).

@@ -181,13 +181,8 @@ def search_profiles(
     best = pooled.argmax(axis=1)
     rows = np.arange(len(bands))
     height = contrast[rows, best]
-    noise = 1.4826 * np.median(np.abs(contrast - np.median(contrast, axis=1, keepdims=True)))
-    shift = best - reach_index(side, kernel_half)
+    # From station to station the tape stays and the noise does not.
+    noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
     return ProfileFit(
-        shift.astype(float), np.full(len(bands), 1.0), height,
+        best - float(side - kernel_half), np.full(len(bands), 1.0), height,
         height > max(_FOUND * noise, _FOUND_FRACTION))
-
-
-def reach_index(side: int, kernel_half: int) -> int:
-    """Index of zero shift in a correlation of 2 side + 1 samples with its kernel."""
-    return side - kernel_half

@@ -1,0 +1,224 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A pose made exact against one image: predict the bands, measure the profiles, refine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.errors import EstimationError
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.prediction import predict_bands
+from nccs_pose.estimation.refine import refine, Refinement
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.line_points import LinePoints
+from nccs_pose.vision.profiles import fit_profiles, ProfileFit, search_profiles
+import numpy as np
+from numpy.typing import NDArray
+
+# A profile is linear in its shift for about so many pixels.
+_LINEAR_PX = 2.0
+_ITERATIONS = 8
+# Poses that differ by less than this predict the same bands, metres and rad.
+_SETTLED = (5e-4, 5e-4)
+_LEAST_STATIONS = 12
+# Neighbours that may share one cause of error (a shade, a tile, a block of JPEG).
+_BLOCK = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A pose laid on an image.
+
+    :ivar pose: T_map_base.
+    :ivar covariance: of (x, y, yaw) (3, 3).
+    :ivar refinement: the last solve.
+    :ivar points: the pixels it rests on, labelled by map line.
+    :ivar explained: fraction of the predicted line pixels that were found.
+    :ivar lines: map lines that it rests on.
+    :ivar colours: the colours as this image shows them.
+    """
+
+    pose: Pose2
+    covariance: Array
+    refinement: Refinement
+    points: LinePoints
+    explained: float
+    lines: tuple[int, ...]
+    colours: tuple[LineColour, ...]
+
+
+class Aligner:
+    """Lays poses on images for one rig and map."""
+
+    def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
+        self._table = table
+        self._map = line_map
+        self._options = options
+        names = tuple(dict.fromkeys(line.colour for line in line_map))
+        self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
+        self.nominal_colours = tuple(LineColour.nominal(name) for name in names)
+
+    def align(
+        self,
+        image: NDArray[np.uint8],
+        start: Pose2,
+        colours: tuple[LineColour, ...],
+        *,
+        reach: float = 0.0,
+        prior: tuple[Pose2, Array] | None = None,
+    ) -> Alignment | None:
+        """Lay a pose on the image from a start near it.
+
+        :param image: (H, W, 3) uint8 BGR.
+        :param reach: search bands of this half width first, px; 0 where the start is within two
+            pixels.
+        :param prior: carries the directions that the lines in view do not fix.
+        :returns: None where too little of what the start predicts is found, or where the poses do
+            not settle.
+        """
+        pose = start
+        if reach > 0.0:
+            searched = self._search(image, start, colours, reach, prior)
+            if searched is None:
+                return None
+            pose = searched
+        result: Alignment | None = None
+        for _ in range(_ITERATIONS):
+            bands = self._bands(pose)
+            if len(bands) < _LEAST_STATIONS:
+                return None
+            fit, colours = self._fit(image, bands, colours)
+            result = self._solve(bands, fit, pose, prior, colours)
+            if result is None:
+                return None
+            step = pose.inverse() @ result.pose
+            pose = result.pose
+            if np.hypot(step.x, step.y) < _SETTLED[0] and abs(step.yaw) < _SETTLED[1]:
+                return result
+        return None
+
+    def _bands(self, pose: Pose2) -> Bands:
+        return predict_bands(self._table, self._map, pose, self._options.stations)
+
+    def _fit(
+        self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...],
+    ) -> tuple[ProfileFit, tuple[LineColour, ...]]:
+        """Fit the bands of each colour with that colour."""
+        if len(colours) == 1:
+            fit, learned = fit_profiles(image, bands, colours[0], self._options.blur)
+            return fit, (learned,)
+        n = len(bands)
+        shift, sigma, contrast = np.zeros(n), np.ones(n), np.zeros(n)
+        found = np.zeros(n, dtype=bool)
+        learned_all = list(colours)
+        for k, colour in enumerate(colours):
+            own = self._colour_of_line[bands.label] == k
+            if own.any():
+                fit, learned_all[k] = fit_profiles(image, bands[own], colour, self._options.blur)
+                shift[own], sigma[own], contrast[own] = fit.shift, fit.sigma, fit.contrast
+                found[own] = fit.found
+        return ProfileFit(shift, sigma, contrast, found), tuple(learned_all)
+
+    def _search(
+        self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
+        reach: float, prior: tuple[Pose2, Array] | None,
+    ) -> Pose2 | None:
+        bands = self._bands(start)
+        pixels, labels = [], []
+        for k, colour in enumerate(colours):
+            own = bands[self._colour_of_line[bands.label] == k]
+            if len(own) < _LEAST_STATIONS:
+                continue
+            fit = search_profiles(image, own, colour, self._options.blur, reach)
+            moved = own.midline + fit.shift[:, None] * own.across
+            pixels.append(moved[fit.found])
+            labels.append(own.label[fit.found])
+        if sum(len(label) for label in labels) < _LEAST_STATIONS:
+            return None
+        found = self._refined(
+            np.concatenate(pixels), np.ones(sum(map(len, labels))), np.concatenate(labels),
+            start, prior)
+        return None if found is None else found[0].pose
+
+    def _refined(
+        self, pixels: Array, sigma: Array, label: NDArray[np.intp], start: Pose2,
+        prior: tuple[Pose2, Array] | None,
+    ) -> tuple[Refinement, NDArray[np.bool_]] | None:
+        """Refine on pixels; returns the solve and which pixels it used, or None."""
+        rays = self._table.rig.back_project(pixels)
+        hit = rays.hit
+        try:
+            return refine(
+                rays[hit], self._map.directions[label[hit]], self._map.moments[label[hit]],
+                start, sigma=sigma[hit], prior=prior, noise_known=False,
+                attitude_sigma=(self._options.height_sigma, self._options.tilt_sigma)), hit
+        except EstimationError:
+            return None
+
+    def _solve(
+        self, bands: Bands, fit: ProfileFit, start: Pose2,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...],
+    ) -> Alignment | None:
+        used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
+        if used.sum() < _LEAST_STATIONS:
+            return None
+        pixels = (bands.midline + fit.shift[:, None] * bands.across)[used]
+        label = bands.label[used]
+        solved = self._refined(pixels, fit.sigma[used], label, start, prior)
+        if solved is None:
+            return None
+        refinement, hit = solved
+        index = np.flatnonzero(used)[hit][refinement.inlier]
+        # A tape half a pixel wide shows half the contrast, and is missed half as badly.
+        worth = bands.spacing * np.minimum(1.0, bands.half_width)
+        scale = float(np.sqrt(np.mean(refinement.residual[refinement.inlier] ** 2)))
+        points = LinePoints(
+            pixels[hit][refinement.inlier], scale * fit.sigma[index], bands.label[index])
+        correlation = _correlation(refinement.residual[refinement.inlier], points.label)
+        return Alignment(
+            refinement.pose, correlation * refinement.covariance, refinement, points,
+            float(worth[index].sum() / worth.sum()),
+            tuple(int(k) for k in np.unique(points.label)), colours)
+
+
+def _correlation(residual: Array, label: NDArray[np.intp]) -> float:
+    """How much more the residuals of neighbours add up than independent ones would.
+
+    The variance of sums over blocks of neighbours against that of single residuals: 1 for white
+    noise, up to the block's size where whole stretches err together.
+    """
+    sums, sizes = [], []
+    for k in np.unique(label):
+        own = residual[label == k]
+        for first in range(0, len(own) - _BLOCK + 1, _BLOCK):
+            sums.append(own[first:first + _BLOCK].sum())
+            sizes.append(_BLOCK)
+    if len(sums) < 6:
+        return 1.0
+    # The fit has taken three degrees of freedom out of the blocks.
+    per_residual = np.square(sums).sum() / np.sum(sizes) * len(sums) / (len(sums) - 3)
+    return float(max(1.0, per_residual / max(np.mean(residual**2), 1e-12)))
+
+
+def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:
+    """Whether two poses agree within so many standard deviations of a covariance (3, 3)."""
+    difference = a.as_array() - b.as_array()
+    difference[2] = wrap_angle(difference[2])
+    return float(difference @ np.linalg.solve(covariance, difference)) <= sigmas**2
