@@ -39,6 +39,7 @@ class Tally:
     :ivar received: images that arrived.
     :ivar missing: images that were sent and did not arrive, by their sequence numbers.
     :ivar lost: images that the middleware lost on the way.
+    :ivar resets: jumps of the stamps into the past, each of which started the tracker anew.
     :ivar refused: messages by cause.
     :ivar errors: exceptions by the function that they came from.
     """
@@ -47,6 +48,7 @@ class Tally:
     answered: int = 0
     missing: int = 0
     lost: int = 0
+    resets: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     errors: Counter[str] = field(default_factory=Counter)
     last_refusal: str = ''
@@ -124,7 +126,8 @@ def pose_status(
 
 
 def image_status(
-    node: str, topic: str, tally: Tally, problem: str, fresh_refusals: int, fresh_lost: int,
+    node: str, topic: str, publishers: int, tally: Tally, problem: str, fresh_refusals: int,
+    fresh_lost: int,
 ) -> DiagnosticStatus:
     """State of the input.
 
@@ -142,9 +145,9 @@ def image_status(
     if problem:
         words, level = problem, DiagnosticStatus.WARN
     values: dict[str, object] = {
-        'topic': topic, 'frames_received': tally.received, 'frames_answered': tally.answered,
+        'topic': topic, 'publishers': publishers, 'frames_received': tally.received, 'frames_answered': tally.answered,
         'frames_dropped_busy': tally.let_go, 'frames_lost_by_middleware': tally.lost,
-        'refused': sum(tally.refused.values()), 'errors': sum(tally.errors.values()),
+        'clock_resets': tally.resets, 'refused': sum(tally.refused.values()), 'errors': sum(tally.errors.values()),
         'last_refusal': tally.last_refusal, 'last_error': tally.last_error}
     values.update({f'refused.{cause}': n for cause, n in sorted(tally.refused.items())})
     values.update({f'error.{name}': n for name, n in sorted(tally.errors.items())})

@@ -42,11 +42,21 @@ class ImageStream:
     reports as lost was lost on the way, the rest was let go because the node was busy.
 
     :ivar topic: full name of the topic.
+    :ivar publishers: how many publish to us at present.
     :ivar decode_s: seconds for decoding the last image.
     :ivar arrived: monotonic time of the last image, seconds.
     """
 
-    def __init__(self, node: Node, transport: str, tally: Tally, on_frame: OnFrame) -> None:
+    def __init__(
+        self, node: Node, transport: str, tally: Tally, on_frame: OnFrame,
+        on_publishers: Callable[[], None],
+    ) -> None:
+        """Subscribe.
+
+        :param transport: raw or compressed.
+        :param on_frame: called with stamp (ns), frame_id and image (H, W, 3) of each.
+        :param on_publishers: called when a publisher came or went.
+        """
         endpoint, kind = (
             (IMAGE, Image) if transport == 'raw' else (IMAGE_COMPRESSED, CompressedImage))
         self._node = node
@@ -54,14 +64,16 @@ class ImageStream:
         self._on_frame = on_frame
         self._sequence: int | None = None
         self._incompatible = ''
-        self._several = False
+        self._on_publishers = on_publishers
+        self.publishers = 0
         self._last_words = ''
         self.decode_s = 0.0
         self.arrived = time.monotonic()
         self._subscription = node.create_subscription(
             kind, endpoint.name, self._receive, profile(endpoint),
             event_callbacks=SubscriptionEventCallbacks(
-                message_lost=self._lost, incompatible_qos=self._mismatched),
+                message_lost=self._lost, incompatible_qos=self._mismatched,
+                matched=self._matched),
             qos_overriding_options=overridable())
         self.topic = self._subscription.topic_name
 
@@ -71,14 +83,12 @@ class ImageStream:
 
     def problem(self, patience: float) -> str:
         """Why no image has come for `patience` seconds; empty if one has."""
-        publishers = self._node.count_publishers(self.topic)
-        self._several = publishers > 1
         silence = time.monotonic() - self.arrived
         if silence < patience:
             words = ''
         elif self._incompatible:
             words = self._incompatible
-        elif not publishers:
+        elif not self.publishers:
             words = f'nothing publishes {self.topic}'
         else:
             words = f'{self.topic} has a publisher, but no image came for a while'
@@ -109,13 +119,17 @@ class ImageStream:
     def _count_missing(self, sequence: int | None) -> None:
         before, self._sequence = self._sequence, sequence
         # Two publishers count apart; a restarted one starts over.
-        if before is not None and sequence is not None and not self._several:
+        if before is not None and sequence is not None and self.publishers < 2:
             self._tally.missing += max(0, sequence - before - 1)
 
     def _lost(self, event: Any) -> None:
         # What was sent before the first image arrived was never ours to lose.
         if self._sequence is not None:
             self._tally.lost += int(event.total_count_change)
+
+    def _matched(self, event: Any) -> None:
+        self.publishers = int(event.current_count)
+        self._on_publishers()
 
     def _mismatched(self, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)

@@ -92,8 +92,8 @@ STATUSES = (
      '`withheld`), reason, age_s, lines_used, points_used, residual_px, expected_px, explained, '
      'claimed, ambiguity, unobserved, candidates, sigma_x_m, sigma_y_m, sigma_yaw_rad'),
     ('`localiser: images`',
-     'topic, frames_received, frames_answered, frames_dropped_busy, frames_lost_by_middleware, '
-     'refused and refused.*cause*, errors and error.*function*, last_refusal, last_error'),
+     'topic, publishers, frames_received, frames_answered, frames_dropped_busy, frames_lost_by_middleware, '
+     'clock_resets, refused and refused.*cause*, errors and error.*function*, last_refusal, last_error'),
     ('`localiser: time`',
      'decode_ms, predict_ms, detect_ms, associate_ms, measure_ms, refine_ms, total_ms, '
      'arrival_to_answer_ms'),
@@ -105,7 +105,8 @@ CAUSES = (
      'that cannot be decoded'),
     ('`image_size`, `image_type`', "an image not of the rig's size; no 8-bit colour image"),
     ('`duplicate_stamp`, `out_of_order`',
-     'an image with the stamp of the last one, or an earlier one'),
+     'an image with the stamp of the last one, or an earlier one (less than `clock_jump`)'),
+    ('`frozen_image`', 'an image that has not changed by a bit although the robot has moved'),
     ('`camera_info`', 'a camera_info that contradicts the rig'),
     ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite, or '
      'no rotation'),

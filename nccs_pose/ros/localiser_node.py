@@ -176,7 +176,8 @@ class LocaliserNode(LifecycleNode):
         self._pose_stamp_ns = None
         self._keeper.offer(self._localiser)
         self._stream = ImageStream(
-            self, self._options.image_transport, self._tally, self._on_frame)
+            self, self._options.image_transport, self._tally, self._on_frame,
+            self._report_diagnostics)
         self._subscriptions_of_active = [
             self._listen(CameraInfo, CAMERA_INFO, self._on_camera_info),
             self._listen(Odometry, ODOM, self._on_odometry),
@@ -214,6 +215,11 @@ class LocaliserNode(LifecycleNode):
         if self._paused:
             return
         estimate = self._localiser.process(stamp_ns, image)
+        if self._estimate is not None and stamp_ns < self._estimate.stamp_ns:
+            back = 1e-9 * (self._estimate.stamp_ns - stamp_ns)
+            self._tally.resets += 1
+            self.get_logger().warning(
+                f'the stamps jumped back by {back:.3f} s: the tracker starts anew')
         self._estimate = estimate
         if self._outputs.publish(estimate, frame_id, image, not self._withheld()):
             self._tally.answered += 1
@@ -327,13 +333,13 @@ class LocaliserNode(LifecycleNode):
         now = self.get_clock().now()
         age = (math.nan if self._pose_stamp_ns is None
                else 1e-9 * (now.nanoseconds - self._pose_stamp_ns))
-        name, tally = self.get_name(), self._tally
+        name, tally = self.get_fully_qualified_name().lstrip('/'), self._tally
         statuses = [diagnostics.pose_status(name, label, self._problem(), self._estimate, age)]
         if self._stream is not None:
             troubles = sum(tally.refused.values()) + sum(tally.errors.values())
             statuses += [
                 diagnostics.image_status(
-                    name, self._stream.topic, tally,
+                    name, self._stream.topic, self._stream.publishers, tally,
                     self._stream.problem(self._options.silence_warning),
                     troubles - self._reported[0], tally.lost - self._reported[1]),
                 diagnostics.time_status(

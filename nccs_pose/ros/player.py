@@ -39,6 +39,8 @@ from rosgraph_msgs.msg import Clock
 CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
 
+SETTLE = 0.5
+
 OnSent = Callable[[str, bytes], None]
 
 
@@ -150,6 +152,8 @@ def wait_for_subscribers(player: Player, topics: Sequence[str], timeout: float) 
     end = time.monotonic() + timeout
     while rclpy.ok() and time.monotonic() < end:
         if all(player.subscribers(topic) for topic in topics):
+            # We know of them; they may not know of us yet, and lose what is best effort.
+            time.sleep(SETTLE if topics else 0.0)
             return True
         time.sleep(0.02)
     return False

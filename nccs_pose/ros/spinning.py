@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+import sys
 import traceback
 from typing import Any
 
@@ -87,11 +88,17 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     The node may have `report(name, exception)`, called for what its callbacks raise, and
     `close()`, called before it is destroyed.
 
-    :returns: exit code: 0 after SIGINT, SIGTERM or an orderly shutdown.
+    :returns: exit code: 0 after SIGINT, SIGTERM or an orderly shutdown, 2 if the ROS arguments
+        cannot be read.
     """
     node: Node | None = None
     try:
-        rclpy.init(args=args)
+        try:
+            rclpy.init(args=args)
+        except RuntimeError as error:  # base of every RCLError
+            # A parameter file that is not there, a remapping that cannot be read.
+            print(f'cannot start: {" ".join(str(error).split())}', file=sys.stderr)
+            return 2
         node = make_node()
         executor = GuardedExecutor(getattr(node, 'report', None) or _log(node))
         executor.add_node(node)

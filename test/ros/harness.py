@@ -1,0 +1,188 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Processes and a user for tests over DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PATIENCE = 30.0
+"""Seconds until a test gives up waiting; a loaded machine is no failure."""
+
+
+class Process:
+    """A program of the package in its own process."""
+
+    def __init__(
+        self, module: str, arguments: list[str], environment: dict[str, str], log: Path,
+    ) -> None:
+        self.log = log
+        with log.open('w') as file:
+            self._popen = subprocess.Popen(
+                [sys.executable, '-m', f'nccs_pose.ros.{module}', *arguments], cwd=REPOSITORY,
+                env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+    def running(self) -> bool:
+        """Whether it still runs."""
+        return self._popen.poll() is None
+
+    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
+        """Send a signal if it runs, and return the exit code."""
+        if self.running():
+            self._popen.send_signal(how)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Return the exit code once it ends."""
+        try:
+            return self._popen.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            self._popen.wait()
+            raise
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        if self.running():
+            self._popen.kill()
+            self._popen.wait()
+
+    @property
+    def output(self) -> str:
+        """Everything that it printed so far."""
+        return self.log.read_text(errors='replace')
+
+
+class User:
+    """Somebody at the other end: subscribes, publishes, calls services."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node('user', context=self._context, use_global_arguments=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.statuses: dict[str, DiagnosticStatus] = {}
+        self.history: list[DiagnosticStatus] = []
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.statuses[status.name] = status
+            self.history.append(status)
+
+    def listen(self, kind: type, topic: str, qos: QoSProfile | int = 100) -> list[Any]:
+        """Subscribe; the list fills with messages."""
+        messages: list[Any] = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def publisher(self, kind: type, topic: str, node: str = 'localiser') -> Any:
+        """A publisher that the node already knows of."""
+        publisher = self.node.create_publisher(kind, topic, 100)
+        assert self.wait(lambda: publisher.get_subscription_count() > 0), topic
+        if topic.split('/')[-1] in ('image', 'compressed'):
+            assert self.wait(lambda: self.count('publishers', node) > 0), topic
+        else:
+            self.spin(0.3)  # a best-effort subscriber may learn of us a little later
+        return publisher
+
+    def wait(self, condition: Callable[[], Any], timeout: float = PATIENCE) -> Any:
+        """Spin until the condition holds; its value, false after the timeout."""
+        end = time.monotonic() + timeout
+        while not (value := condition()):
+            if time.monotonic() > end:
+                return value
+            self._executor.spin_once(timeout_sec=0.02)
+        return value
+
+    def spin(self, seconds: float) -> None:
+        """Spin for a while."""
+        self.wait(lambda: False, seconds)
+
+    def call(self, kind: type, service: str, request: Any) -> Any:
+        """Call a service and return its answer."""
+        client = self.node.create_client(kind, service)
+        assert self.wait(client.service_is_ready), service
+        future = client.call_async(request)
+        assert self.wait(future.done), f'{service} does not answer'
+        self.node.destroy_client(client)
+        return future.result()
+
+    def value(self, status: str, key: str) -> str:
+        """Latest value of a diagnostic; empty if there is none."""
+        found = self.statuses.get(status)
+        return next((v.value for v in found.values if v.key == key), '') if found else ''
+
+    def count(self, key: str, node: str = 'localiser') -> int:
+        """Latest count among the diagnostics of the images."""
+        return int(self.value(f'{node}: images', key) or 0)
+
+    def close(self) -> None:
+        """Leave."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+class World:
+    """A DDS domain of its own, the processes in it and a user."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self._folder = folder
+        self._domain = domain
+        self._processes: list[Process] = []
+        self.user = User(domain)
+
+    def start(self, module: str, *arguments: str, **environment: str) -> Process:
+        """Start `python -m nccs_pose.ros.<module>`."""
+        log = self._folder / f'{len(self._processes)}_{module}.log'
+        process = Process(module, list(arguments), {
+            **os.environ, 'ROS_DOMAIN_ID': str(self._domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_LOG_DIR': str(self._folder / 'ros_log'), **environment}, log)
+        self._processes.append(process)
+        return process
+
+    def localiser(self, *ros_arguments: str, **parameters: object) -> Process:
+        """Start the node under test; a parameter that is None is not given."""
+        arguments = ['--ros-args', *ros_arguments]
+        for name, value in parameters.items():
+            if value is None:
+                continue
+            text = str(value).lower() if isinstance(value, bool) else value
+            arguments += ['-p', f'{name}:={text}']
+        return self.start('localiser_node', *arguments)
+
+    def close(self) -> None:
+        """End everything."""
+        for process in self._processes:
+            process.kill()
+        self.user.close()

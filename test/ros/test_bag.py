@@ -1,0 +1,125 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A recorded robot, played over DDS: the player by itself, and the node against the truth."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
+from nccs_pose.evaluation.metrics import compare, summarise  # noqa: E402
+from nccs_pose.evaluation.trajectory import Trajectory  # noqa: E402
+from nccs_pose.files.bags import BagReader  # noqa: E402
+from nccs_pose.files.serialised_bag import SerialisedBag  # noqa: E402
+from nccs_pose.ros.conversions import pose_to_planar, stamp_to_ns  # noqa: E402
+import numpy as np  # noqa: E402
+from rclpy.serialization import serialize_message  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import CameraInfo  # noqa: E402
+
+BAG = 'bags/room'
+IMAGE = '/camera/image_raw/compressed'
+
+
+def test_bag_is_localised_over_dds(world, repository):
+    user = world.user
+    node = world.localiser(
+        '--params-file', 'config/room.yaml', '-r', f'image/compressed:={IMAGE}',
+        '-r', 'camera_info:=/camera/camera_info', use_sim_time=True)
+    poses = user.listen(PoseWithCovarianceStamped, 'pose')
+    player = world.start('player', BAG, '--rate', '2.5', '--clock', '--wait-for', IMAGE)
+    assert user.wait(lambda: not player.running(), 60.0)
+    assert player.wait() == 0, player.output
+    user.spin(1.5)
+    with BagReader(repository / BAG) as bag:
+        truth, frames = bag.ground_truth(), bag.image_count()
+    estimated = Trajectory(
+        np.array([stamp_to_ns(p.header.stamp) for p in poses], dtype=np.int64),
+        np.array([pose_to_planar(p.pose.pose, 'pose').as_array() for p in poses]))
+    errors = compare(estimated, truth)
+    good = (errors.translation < 0.05) & (errors.yaw < np.radians(1.0))
+    received, busy = user.count('frames_received'), user.count('frames_dropped_busy')
+    # Every frame is accounted for; a loaded machine may let some go.
+    assert received + busy == frames
+    assert received >= frames // 3
+    assert np.count_nonzero(good) >= 0.9 * received, summarise(
+        errors, frames=received, answered=len(poses))
+    # The clock is the bag's.
+    assert abs(float(user.value('localiser: pose', 'age_s'))) < 5.0
+    assert 'tf2_msgs/msg/TFMessage is not installed' in player.output or 'tf_static' in (
+        player.output)
+    assert node.stop() == 0, node.output
+
+
+def test_player_keeps_bytes_order_and_timing(world, repository):
+    user = world.user
+    infos = user.listen(CameraInfo, '/camera/camera_info')
+    truths = user.listen(PoseStamped, '/ground_truth/pose')
+    arrivals: list[float] = []
+    clocks = user.listen(Clock, '/clock')
+    user.node.create_subscription(
+        CameraInfo, '/camera/camera_info', lambda m: arrivals.append(time.monotonic()), 100)
+    player = world.start(
+        'player', BAG, '--rate', '4', '--start-offset', '20.2', '--clock', '--topics',
+        '/camera/camera_info', '/ground_truth/pose', '--wait-for', '/camera/camera_info',
+        '/ground_truth/pose')
+    assert user.wait(lambda: not player.running()), player.output
+    user.spin(0.3)
+    with SerialisedBag(repository / BAG) as bag:
+        recorded = [
+            (received, data) for topic, received, data in bag.messages(
+                ['/camera/camera_info'], bag.start_ns + 20_200_000_000)]
+        begin, end = bag.start_ns + 20_200_000_000, bag.end_ns
+    assert [serialize_message(m) for m in infos] == [data for _, data in recorded]
+    assert len(truths) > 200
+    # Four times as fast: compared by the longest stretch, which a loaded machine hardly changes.
+    played = arrivals[-1] - arrivals[0]
+    assert played == pytest.approx(1e-9 * (recorded[-1][0] - recorded[0][0]) / 4.0, abs=0.4)
+    stamps = [stamp_to_ns(c.clock) for c in clocks]
+    assert stamps == sorted(stamps)
+    assert begin - 10**9 < stamps[0]
+    assert stamps[-1] == end
+
+
+def test_player_loops_until_it_is_stopped(world):
+    user = world.user
+    clocks = user.listen(Clock, '/clock')
+    player = world.start('player', BAG, '--loop', '--clock', '--start-offset', '29', '--rate', '3')
+
+    def jumps() -> int:
+        stamps = np.array([stamp_to_ns(c.clock) for c in clocks], dtype=np.int64)
+        return int(np.count_nonzero(np.diff(stamps) < -10**9))
+
+    assert user.wait(lambda: jumps() >= 2), player.output
+    assert player.stop(signal.SIGINT) == 0, player.output
+    assert 'Traceback' not in player.output
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['no/such/bag'], 'no/such/bag: no such bag'),
+    ([BAG, '--topics', '/nothing'], 'has no topic /nothing'),
+    ([BAG, '--rate', '-1'], 'must be greater than 0'),
+    ([BAG, '--wait-for', '/tf_statics'], '/tf_statics'),
+])
+def test_player_says_what_it_cannot_play(world, arguments, words):
+    player = world.start('player', *arguments)
+    assert player.wait() == 2
+    assert words in player.output
+    assert 'Traceback' not in player.output

@@ -1,0 +1,130 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The managed node: transitions, refusals, signals."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
+
+
+def state(user) -> int:
+    return user.call(GetState, '/localiser/get_state', GetState.Request()).current_state.id
+
+
+def change(user, transition: int, label: str = '') -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition, label=label))
+    return user.call(ChangeState, '/localiser/change_state', request).success
+
+
+def test_full_cycle_and_transitions_that_are_not_allowed(world):
+    node, user = world.localiser(autostart=False, **ROOM), world.user
+    assert state(user) == State.PRIMARY_STATE_UNCONFIGURED
+    # Not allowed here: answered, and nothing changes.
+    for transition in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE,
+                       Transition.TRANSITION_CLEANUP, 99, 255):
+        assert not change(user, transition), transition
+    assert not change(user, 0, 'no such transition')
+    assert state(user) == State.PRIMARY_STATE_UNCONFIGURED
+    for _ in range(2):
+        assert change(user, Transition.TRANSITION_CONFIGURE)
+        assert not change(user, Transition.TRANSITION_CONFIGURE)
+        assert change(user, Transition.TRANSITION_ACTIVATE)
+        assert state(user) == State.PRIMARY_STATE_ACTIVE
+        assert not change(user, Transition.TRANSITION_CONFIGURE)
+        assert change(user, Transition.TRANSITION_DEACTIVATE)
+        assert state(user) == State.PRIMARY_STATE_INACTIVE
+        assert change(user, Transition.TRANSITION_CLEANUP)
+        assert state(user) == State.PRIMARY_STATE_UNCONFIGURED
+    assert change(user, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    assert state(user) == State.PRIMARY_STATE_FINALIZED
+    assert not change(user, Transition.TRANSITION_CONFIGURE)
+    assert node.stop(signal.SIGINT) == 0, node.output
+
+
+@pytest.mark.parametrize(('changed', 'words'), [
+    ({'map_file': 'nowhere/map.yaml'}, 'nowhere/map.yaml'),
+    ({'rig_file': 'config/room_map.yaml'}, 'room_map.yaml'),
+    ({'rig_file': None}, 'rig_file is not set'),
+    ({'tf_mode': 'map_to_moon'}, 'tf_mode'),
+    ({'camera_info_tolerance': 7.5}, 'camera_info_tolerance'),
+    ({'silence_warning': 'soon'}, 'silence_warning'),
+])
+def test_bad_configuration_fails_with_the_reason_and_the_node_lives(world, changed, words):
+    node, user = world.localiser(**{**ROOM, **changed}), world.user
+    status = user.wait(lambda: user.statuses.get('localiser: pose'))
+    assert status, node.output
+    assert words in status.message
+    assert status.level == b'\x02'
+    assert words in node.output
+    assert state(user) == State.PRIMARY_STATE_UNCONFIGURED
+    assert not change(user, Transition.TRANSITION_CONFIGURE)
+    relocalise = user.call(Trigger, '/localiser/relocalise', Trigger.Request())
+    assert not relocalise.success
+    assert node.stop(signal.SIGTERM) == 0, node.output
+
+
+def test_transforms_without_tf2_ros_fail_with_the_reason(world):
+    try:
+        import tf2_ros  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip('tf2_ros is installed')
+    node, user = world.localiser(tf_mode='map_to_base', **ROOM), world.user
+    assert user.wait(lambda: 'tf2_ros' in user.value('localiser: pose', 'reason'))
+    assert node.running()
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_the_active_node_cleanly(world, how):
+    node, user = world.localiser(**ROOM), world.user
+    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'active'), node.output
+    assert node.stop(how) == 0, node.output
+    assert 'Traceback' not in node.output
+
+
+def test_silence_is_said_with_the_topic(world):
+    node, user = world.localiser('-r', 'image:=/front/image', silence_warning=0.5, **ROOM), world.user
+    assert user.wait(lambda: 'nothing publishes /front/image' in getattr(
+        user.statuses.get('localiser: images'), 'message', '')), node.output
+    assert 'nothing publishes /front/image' in node.output
+
+
+def test_pause_is_said(world):
+    world.localiser(**ROOM)
+    user = world.user
+    assert user.call(SetBool, '/localiser/set_paused', SetBool.Request(data=True)).success
+    assert user.wait(lambda: user.value('localiser: pose', 'reason') == 'paused')
+    assert user.call(SetBool, '/localiser/set_paused', SetBool.Request(data=False)).success
+    assert user.wait(lambda: user.value('localiser: pose', 'reason') != 'paused')
+
+
+@pytest.mark.parametrize('arguments', [
+    ('--params-file', 'nowhere.yaml'), ('--no-such-option',), ('-r', '3:4:5')])
+def test_ros_arguments_that_cannot_be_read_are_said_in_a_sentence(world, arguments):
+    node = world.start('localiser_node', '--ros-args', *arguments)
+    assert node.wait() == 2
+    assert 'cannot start: ' in node.output
+    assert 'Traceback' not in node.output

@@ -1,0 +1,106 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters over DDS: described, checked, changed live."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import (  # noqa: E402
+    DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically)
+
+ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
+
+
+def number(name: str, value: float) -> Parameter:
+    return Parameter(name=name, value=ParameterValue(
+        type=ParameterType.PARAMETER_DOUBLE, double_value=value))
+
+
+def integer(name: str, value: int) -> Parameter:
+    return Parameter(name=name, value=ParameterValue(
+        type=ParameterType.PARAMETER_INTEGER, integer_value=value))
+
+
+def text(name: str, value: str) -> Parameter:
+    return Parameter(name=name, value=ParameterValue(
+        type=ParameterType.PARAMETER_STRING, string_value=value))
+
+
+def read(user, *names: str):
+    answer = user.call(
+        GetParameters, '/localiser/get_parameters', GetParameters.Request(names=names))
+    return answer.values
+
+
+def set_each(user, *parameters: Parameter):
+    return user.call(SetParameters, '/localiser/set_parameters',
+                     SetParameters.Request(parameters=parameters)).results
+
+
+def test_parameters_are_described_checked_and_changed(world):
+    node, user = world.localiser(camera_info_tolerance=0, **ROOM), world.user
+    names = user.call(
+        ListParameters, '/localiser/list_parameters', ListParameters.Request()).result.names
+    described = user.call(
+        DescribeParameters, '/localiser/describe_parameters',
+        DescribeParameters.Request(names=names)).descriptors
+    ours = [d for d in described if not d.name.startswith(('qos_overrides', 'use_sim_time'))
+            and 'type_description' not in d.name]
+    assert len(ours) > 20
+    assert all(len(d.description) > 10 for d in ours)
+    by_name = {d.name: d for d in ours}
+    assert by_name['rig_file'].read_only
+    assert not by_name['camera_info_tolerance'].read_only
+    assert by_name['camera_info_tolerance'].floating_point_range[0].to_value == 1.0
+    assert any(name.endswith('image.subscription.reliability') for name in names)
+
+    # An int in YAML or on the command line is meant as a number.
+    assert read(user, 'camera_info_tolerance')[0].double_value == 0.0
+    good, as_int, range_, kind, read_only, unknown = set_each(
+        user, number('camera_info_tolerance', 0.1), integer('transform_tolerance', 1),
+        number('camera_info_tolerance', 3.0), text('camera_info_tolerance', 'much'),
+        text('rig_file', 'other.yaml'), number('no_such_parameter', 1.0))
+    assert good.successful
+    assert as_int.successful, as_int.reason
+    for refused in (range_, kind, read_only, unknown):
+        assert not refused.successful
+        assert refused.reason
+    choice, = set_each(user, text('camera_info_check', 'perhaps'))
+    assert not choice.successful
+    assert 'refuse, warn, off' in choice.reason
+    values = read(user, 'camera_info_tolerance', 'transform_tolerance', 'rig_file')
+    assert values[0].double_value == 0.1
+    assert values[1].double_value == 1.0
+    assert values[2].string_value == ROOM['rig_file']
+
+    # All or nothing.
+    result = user.call(
+        SetParametersAtomically, '/localiser/set_parameters_atomically',
+        SetParametersAtomically.Request(parameters=[
+            number('camera_info_tolerance', 0.5), number('transform_tolerance', -1.0)])).result
+    assert not result.successful
+    assert 'transform_tolerance' in result.reason
+    assert read(user, 'camera_info_tolerance')[0].double_value == 0.1
+    assert node.running()
+
+
+def test_unknown_parameter_is_named_with_the_one_meant(world):
+    node, user = world.localiser(map_fil='x', **ROOM), world.user
+    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'active')
+    assert 'parameter map_fil is unknown and has no effect; did you mean map_file?' in node.output

@@ -1,0 +1,149 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The node on live streams: stand-in camera, two robots at once, too many frames."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
+from nccs_pose.ros.conversions import decode, image_message, stamp_to_ns  # noqa: E402
+import numpy as np  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
+ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
+
+
+def planar(pose) -> np.ndarray:
+    """x, y and yaw of a geometry_msgs/Pose."""
+    q = pose.orientation
+    yaw = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_euler('ZYX')[0]
+    return np.array([pose.position.x, pose.position.y, yaw])
+
+
+def error(pose, truth: np.ndarray) -> tuple[float, float]:
+    """Translation (m) and yaw (rad) error of a geometry_msgs/Pose."""
+    dx, dy, dyaw = planar(pose) - truth
+    return float(np.hypot(dx, dy)), abs(float(np.angle(np.exp(1j * dyaw))))
+
+
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+def test_stand_in_camera_is_localised_live(world, transport):
+    user = world.user
+    node = world.localiser(image_transport=transport, **ARENA)
+    camera = world.start(
+        'stand_in_camera', '--ros-args', '-p', f'image_transport:={transport}', '-p', 'rate:=4.0')
+    poses = user.listen(PoseWithCovarianceStamped, 'pose')
+    truths = user.listen(PoseStamped, 'ground_truth/pose')
+    infos = user.listen(CameraInfo, 'camera_info')
+    debug = user.listen(Image, 'localiser/debug_image')
+    markers = user.listen(MarkerArray, 'localiser/markers')
+    assert user.wait(lambda: len(poses) >= 8 and debug and markers), node.output + camera.output
+    user.spin(0.3)
+    truth = {stamp_to_ns(t.header.stamp): planar(t.pose) for t in truths}
+    compared = [p for p in poses if stamp_to_ns(p.header.stamp) in truth]
+    assert len(compared) >= 6
+    for pose in compared:
+        translation, yaw = error(pose.pose.pose, truth[stamp_to_ns(pose.header.stamp)])
+        assert translation < 0.05
+        assert yaw < np.radians(1.0)
+        assert pose.header.frame_id == 'map'
+        assert np.linalg.eigvalsh(pose.pose.covariance.reshape(6, 6))[0] > 0.0
+    assert infos[0].header.frame_id == 'camera_optical'
+    assert decode(debug[-1]).shape == (480, 640, 3)
+    assert {m.header.frame_id for m in markers[-1].markers} == {'map'}
+    assert user.value('localiser: pose', 'state') == 'tracking'
+    assert user.count('refused') == user.count('errors') == 0
+    assert camera.stop(signal.SIGTERM) == 0, camera.output
+    assert node.stop(signal.SIGINT) == 0, node.output
+
+
+def test_two_robots_in_one_domain_do_not_disturb_each_other(world, arena):
+    user = world.user
+    # Robot b is always half the drive ahead.
+    robots, half = ('a', 'b'), len(arena) // 2
+    for robot in robots:
+        world.localiser('-r', f'__ns:=/{robot}', frame_prefix=f'{robot}/', **ARENA)
+    poses = {r: user.listen(PoseWithCovarianceStamped, f'/{r}/pose') for r in robots}
+    images = {r: user.publisher(Image, f'/{r}/image', f'{r}/localiser') for r in robots}
+    truth: dict[str, dict[int, np.ndarray]] = {robot: {} for robot in robots}
+    for k in range(half):
+        for robot, sample in zip(robots, (arena[k], arena[half + k])):
+            stamp_ns = arena[k].stamp_ns  # the same for both
+            truth[robot][stamp_ns] = sample.pose.as_array()
+            images[robot].publish(image_message(stamp_ns, f'{robot}/camera', sample.image))
+        user.spin(0.15)
+    assert user.wait(lambda: all(poses.values()))
+    user.spin(0.3)
+    for robot in robots:
+        assert len(poses[robot]) >= half - 2
+        for pose in poses[robot]:
+            translation, _ = error(pose.pose.pose, truth[robot][stamp_to_ns(pose.header.stamp)])
+            assert translation < 0.05
+    assert {'a/localiser: pose', 'b/localiser: pose'} <= set(user.statuses)
+    request = user.count('frames_received', 'a/localiser'), user.count(
+        'frames_received', 'b/localiser')
+    assert request == (half, half)
+
+
+def test_more_frames_than_it_can_use_are_let_go_and_the_newest_is_answered(world, arena):
+    node, user = world.localiser(**ARENA), world.user
+    poses = user.listen(PoseWithCovarianceStamped, 'pose')
+    images = user.publisher(Image, 'image')
+    messages = [image_message(s.stamp_ns, 'camera', s.image) for s in arena]
+    images.publish(messages[0])
+    assert user.wait(lambda: poses), node.output
+    # A burst as fast as DDS takes it, to and fro along the drive with rising stamps.
+    order = [*range(1, len(arena)), *range(len(arena) - 2, 0, -1)] * 4
+    sent = 1
+    for k in order:
+        message = image_message(
+            arena[0].stamp_ns + 20_000_000 * sent, 'camera', arena[k].image)
+        images.publish(message)
+        sent += 1
+        time.sleep(0.001)
+    last = stamp_to_ns(message.header.stamp)
+    assert user.wait(lambda: stamp_to_ns(poses[-1].header.stamp) == last, 5.0), node.output
+    assert user.wait(lambda: user.count('frames_received') + user.count(
+        'frames_dropped_busy') + user.count('frames_lost_by_middleware') == sent), (
+        sent, user.statuses['localiser: images'])
+    assert user.count('frames_dropped_busy') > 0
+    stamps = [stamp_to_ns(p.header.stamp) for p in poses]
+    assert stamps == sorted(set(stamps))
+
+
+def test_backward_jump_of_the_stamps_resets_the_tracker_once(world, arena):
+    node, user = world.localiser(**ARENA), world.user
+    poses = user.listen(PoseWithCovarianceStamped, 'pose')
+    images = user.publisher(Image, 'image')
+    # The bag is played twice; half a minute lies between.
+    for lap in (30_000_000_000, 0):
+        for sample in arena:
+            images.publish(image_message(sample.stamp_ns + lap, 'camera', sample.image))
+            user.spin(0.08)
+    assert user.wait(lambda: poses and stamp_to_ns(
+        poses[-1].header.stamp) == arena[-1].stamp_ns), node.output
+    second = {stamp_to_ns(p.header.stamp) for p in poses} & {s.stamp_ns for s in arena}
+    assert len(second) >= len(arena) - 2
+    assert user.wait(lambda: user.count('clock_resets') == 1), node.output
+    assert node.output.count('jumped back by') == 1
+    assert user.count('refused') == user.count('errors') == 0

@@ -1,0 +1,149 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The TF contract, with a tf2_ros that remembers what it is given (the wheels have none)."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from nccs_pose.errors import OptionError  # noqa: E402
+from nccs_pose.geometry.pose import Pose2  # noqa: E402
+from nccs_pose.ros.conversions import ns_to_stamp, yaw_quaternion  # noqa: E402
+from nccs_pose.ros.node_options import NodeOptions  # noqa: E402
+from nccs_pose.ros.transforms import TransformOutput  # noqa: E402
+import numpy as np  # noqa: E402
+from rclpy.time import Time  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+STAMP = 1_700_000_000_123_456_789
+
+
+class TransformError(Exception):
+    """What a lookup raises."""
+
+
+class Tf2:
+    """A transform tree of odom -> base_link, and what was broadcast."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.known: dict[tuple[str, str, int], TransformStamped] = {}
+        self.sent: list[TransformStamped] = []
+        module = types.ModuleType('tf2_ros')
+        module.TransformException = TransformError
+        module.Buffer = lambda node: types.SimpleNamespace(lookup_transform=self.lookup)
+        module.TransformListener = lambda buffer, node: types.SimpleNamespace(
+            unregister=lambda: None)
+        module.TransformBroadcaster = lambda node: types.SimpleNamespace(
+            sendTransform=self.sent.append)
+        monkeypatch.setitem(sys.modules, 'tf2_ros', module)
+
+    def lookup(self, target: str, source: str, time: Time) -> TransformStamped:
+        """Transform that maps coordinates in source to coordinates in target."""
+        try:
+            return self.known[target, source, time.nanoseconds]
+        except KeyError as error:
+            raise TransformError(f'no {target} <- {source}') from error
+
+    def add(self, parent: str, child: str, stamp_ns: int, pose: Pose2) -> None:
+        """Let somebody have broadcast parent -> child."""
+        message = TransformStamped()
+        message.transform.translation.x, message.transform.translation.y = pose.x, pose.y
+        message.transform.rotation = yaw_quaternion(pose.yaw)
+        self.known[parent, child, stamp_ns] = message
+
+
+@pytest.fixture
+def tf2(monkeypatch: pytest.MonkeyPatch) -> Tf2:
+    return Tf2(monkeypatch)
+
+
+def matrix(message: TransformStamped) -> np.ndarray:
+    """Homogeneous matrix of a transform."""
+    result, t, q = np.eye(4), message.transform.translation, message.transform.rotation
+    result[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    result[:3, 3] = t.x, t.y, t.z
+    return result
+
+
+def planar_matrix(x: float, y: float, yaw: float) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_euler('z', yaw).as_matrix()
+    result[:2, 3] = x, y
+    return result
+
+
+def output(**options: object) -> tuple[TransformOutput, list[str]]:
+    refusals: list[str] = []
+    return TransformOutput(
+        None, NodeOptions(**options), lambda cause, words: refusals.append(cause)), refusals
+
+
+def test_map_to_odom_makes_map_to_base_the_estimate(tf2: Tf2):
+    out, _ = output(tf_mode='map_to_odom', frame_prefix='robot1/')
+    tf2.add('robot1/odom', 'robot1/base_link', STAMP, Pose2(3.0, -1.0, 0.7))
+    out.broadcast(STAMP, Pose2(0.2, 0.4, -2.9))
+    (sent,) = tf2.sent
+    assert (sent.header.frame_id, sent.child_frame_id) == ('map', 'robot1/odom')
+    assert sent.header.stamp == ns_to_stamp(STAMP)
+    np.testing.assert_allclose(
+        matrix(sent) @ planar_matrix(3.0, -1.0, 0.7), planar_matrix(0.2, 0.4, -2.9), atol=1e-12)
+
+
+def test_late_odometry_is_waited_for_and_missing_odometry_is_counted(tf2: Tf2):
+    out, refusals = output(tf_mode='map_to_odom')
+    out.broadcast(STAMP, Pose2(1.0, 2.0, 0.5))
+    out.retry(STAMP + 50_000_000)
+    assert tf2.sent == []
+    tf2.add('odom', 'base_link', STAMP, Pose2(0.1, 0.0, 0.0))
+    out.retry(STAMP + 60_000_000)
+    assert len(tf2.sent) == 1
+    assert not out.waits
+    out.broadcast(STAMP + 1, Pose2(1.0, 2.0, 0.5))
+    out.retry(STAMP + 2_000_000_000)
+    assert not out.waits
+    assert len(tf2.sent) == 1
+    assert refusals == ['tf_missing']
+
+
+def test_odometry_that_is_no_rotation_is_not_passed_on(tf2: Tf2):
+    out, refusals = output(tf_mode='map_to_odom')
+    tf2.add('odom', 'base_link', STAMP, Pose2())
+    tf2.known['odom', 'base_link', STAMP].transform.rotation.w = float('nan')
+    out.broadcast(STAMP, Pose2())
+    assert tf2.sent == []
+    assert refusals == ['tf_pose']
+
+
+def test_map_to_base_is_the_estimate_with_its_tolerance(tf2: Tf2):
+    out, _ = output(tf_mode='map_to_base', transform_tolerance=0.25)
+    out.broadcast(STAMP, Pose2(1.0, 2.0, 0.5))
+    (sent,) = tf2.sent
+    assert (sent.header.frame_id, sent.child_frame_id) == ('map', 'base_link')
+    assert sent.header.stamp == ns_to_stamp(STAMP + 250_000_000)
+    np.testing.assert_allclose(matrix(sent), planar_matrix(1.0, 2.0, 0.5), atol=1e-12)
+
+
+def test_none_sends_nothing_and_needs_no_tf2(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    out, _ = output(tf_mode='none')
+    out.broadcast(STAMP, Pose2())
+    with pytest.raises(OptionError, match='apt install ros-jazzy-tf2-ros-py'):
+        output(tf_mode='map_to_odom')
