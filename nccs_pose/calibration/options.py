@@ -38,7 +38,7 @@ class CalibrationOptions:
     rough_cop: float = option(
         3e-3, unit='m', low=1e-6, high=0.1, doc='Of the centre of projection.')
     rough_cop_sideways: float = option(
-        5e-5, unit='m', low=1e-7, high=0.1,
+        2e-5, unit='m', low=1e-7, high=0.1,
         doc='Of the centre of projection out of the plane x = 0 of the mirror frame. Small: the '
         "mount's yaw is held, and with it base_link's heading; as large as rough_cop: the "
         "camera's heading is.")
@@ -46,9 +46,9 @@ class CalibrationOptions:
         0.035, unit='rad', low=1e-6, high=0.5, doc='Of the camera against the mirror.')
     rough_height: float = option(0.02, unit='m', low=1e-6, high=1.0, doc='Of the height.')
     rough_tilt: float = option(
-        2.5e-3, unit='rad', low=1e-6, high=0.5,
-        doc='Of the mirror against the robot. Small: on a sphere it holds the turn about the '
-        'centre that no line can show.')
+        8.7e-3, unit='rad', low=1e-6, high=0.5,
+        doc='Of the mirror against the robot. On a sphere that tilt is held: a turn about the '
+        'centre shows in no line.')
     rough_mirror: float = option(
         0.02, low=1e-6, high=0.5, doc="Of the mirror's shape, relative to its size.")
     rough_principal_point: float = option(

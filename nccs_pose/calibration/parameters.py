@@ -69,14 +69,18 @@ class RigParameters:
     """The free parameters around a rough rig and map.
 
     :param free_lines: names of map lines whose place is free.
+    :param hold_gauge: leave out the tilt of a sphere, whose effect the camera's place and turn
+        have as well: estimate one of the two.
     :raises CalibrationError: if a name is no line of the map, or every line would be free.
     """
 
     def __init__(
         self, rig: Rig, line_map: LineMap, options: CalibrationOptions | None = None,
-        free_lines: Sequence[str] = (),
+        free_lines: Sequence[str] = (), *, hold_gauge: bool = True,
     ) -> None:
         options = options or CalibrationOptions()
+        if hold_gauge and rig.mirror.kind == 'sphere':
+            options = replace(options, tilt=False)
         self.rough = RigModel(rig, line_map)
         self.lines = _line_indices(line_map, free_lines)
         # A rim cuts rays off while the rig still moves; it is no measurement, so leave it out.

@@ -17,9 +17,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from nccs_pose.calibration.adjustment import adjust, Adjustment
+from nccs_pose.calibration.adjustment import adjust, Adjustment, ArrowSystem, Problem
 from nccs_pose.calibration.first_poses import first_poses
 from nccs_pose.calibration.frames import advice, choose, frame_information, Terrain
 from nccs_pose.calibration.gauge import (
@@ -115,10 +115,24 @@ def calibrate(
     held_out = judge(rough, model, [thin[i] for i in held], all_poses[held])
     good, verdict = _verdict(first, result, fit, held_out)
     return Calibration(
-        parameters, result, observations, weak_directions(result.information, parameters, model),
+        parameters, result, observations, _weak(parameters, model, observations, result, options),
         seen_covariance(result.information, parameters.spread),
         pose_uncertainty(result.pose_gain, result.poses, result.covariance), fit, held_out,
         verdict, good)
+
+
+def converge(
+    parameters: RigParameters, frames: Sequence[FrameObservation], poses: Array,
+    options: CalibrationOptions,
+) -> Array:
+    """Theta (P,) that explains frames with known poses (F, 3) at all; no verdict on it yet.
+
+    :raises CalibrationError: if nothing explains them.
+    """
+    usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= _LEAST_LINES]
+    _demand_frames(len(usable), len(frames), replace(options, min_frames=2))
+    thin = [frames[i].thinned(options.points_per_edge) for i in usable]
+    return _start(parameters, thin, np.asarray(poses, dtype=float)[usable]).adjustment.theta
 
 
 def seen_covariance(information: Array, spread: Array) -> Array:
@@ -127,6 +141,19 @@ def seen_covariance(information: Array, spread: Array) -> Array:
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
     inverse = np.where(values >= 1.0, 1.0 / (1.0 + np.maximum(values, 0.0)), 0.0)
     return (vectors * inverse) @ vectors.T * np.outer(spread, spread)
+
+
+def _weak(
+    parameters: RigParameters, model: RigModel, observations: Observations, result: Adjustment,
+    options: CalibrationOptions,
+) -> tuple[WeakDirection, ...]:
+    """What the lines do not tell, of everything that could have been free around the result."""
+    names = [parameters.rough.line_map[i].name for i in parameters.lines]
+    all_of_it = RigParameters(model.rig, model.line_map, options, names, hold_gauge=False)
+    terms = Problem(all_of_it, observations).linearise(np.zeros(len(all_of_it)), result.poses)
+    system = ArrowSystem.of(terms, result.inlier.astype(float), observations.slices())
+    information = system.reduced()[0] / max(1.0, result.reduced_chi2)
+    return weak_directions(information, all_of_it, model)
 
 
 def _start(

@@ -1,0 +1,157 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From images to a calibration: the localiser measures, and measures again under a better rig."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from nccs_pose.calibration.blob_labels import label_blobs
+from nccs_pose.calibration.observations import FrameObservation
+from nccs_pose.calibration.options import CalibrationOptions
+from nccs_pose.calibration.parameters import RigParameters
+from nccs_pose.calibration.procedure import calibrate, Calibration, converge
+from nccs_pose.errors import CalibrationError, FrameRefusedError
+from nccs_pose.estimation.estimate import State
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.rig import Rig
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Images = Callable[[], Iterable[tuple[int, Image]]]
+
+_PASSES = 4
+_LEAST_LINES = 2
+_SETTLED = 0.3  # fraction of a standard deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What the localiser made of a drive under one rig.
+
+    :ivar frames: those that it tracked.
+    :ivar poses: theirs, T_map_base (F, 3).
+    :ivar seen: how many images there were.
+    :ivar reasons: why the others gave nothing, with counts.
+    """
+
+    frames: list[FrameObservation]
+    poses: Array
+    seen: int
+    reasons: Counter[str]
+
+
+def measure(
+    rig: Rig, line_map: LineMap, images: Iterable[tuple[int, Image]],
+    options: LocaliserOptions | None = None,
+) -> Measured:
+    """Run the localiser over images and keep what it measured on the lines.
+
+    The localiser measures the middle of the tapes, with the curve's bias taken out.
+    """
+    # The rig's height is what is to be found; no frame may have its own.
+    options = options or LocaliserOptions(height_sigma=0.0)
+    localiser = Localiser(rig, line_map, options)
+    frames: list[FrameObservation] = []
+    poses: list[Array] = []
+    reasons: Counter[str] = Counter()
+    seen = 0
+    for stamp_ns, image in images:
+        seen += 1
+        try:
+            estimate = localiser.process(stamp_ns, image)
+        except FrameRefusedError as error:
+            reasons[error.cause] += 1
+            continue
+        if estimate.state is not State.TRACKING or not estimate.pose or not estimate.points:
+            reasons[estimate.reason] += 1
+            continue
+        points = estimate.points[estimate.points.label >= 0]
+        frames.append(FrameObservation(stamp_ns, points, np.zeros(len(points), dtype=np.int8)))
+        poses.append(estimate.pose.as_array())
+    return Measured(frames, np.array(poses).reshape(-1, 3), seen, reasons)
+
+
+def calibrate_images(
+    rig: Rig, line_map: LineMap, images: Images, options: CalibrationOptions | None = None,
+    free_lines: Sequence[str] = (), on_pass: Callable[[str], None] = lambda words: None,
+) -> Calibration:
+    """Refine a rough rig from the images of a drive.
+
+    Under the rough rig the localiser follows some frames, and from these a better rig is
+    estimated, under which it follows more; a rig too rough to follow any frame is refined from
+    the blobs of the lines' colour first.
+
+    :param images: gives (stamp in ns, BGR image) anew at each call.
+    :param on_pass: told in words how far it is.
+    :raises CalibrationError: with a sentence that says what is missing.
+    """
+    options = options or CalibrationOptions()
+    parameters = RigParameters(rig, line_map, options, free_lines)
+    better, before = rig, 0
+    measured = measure(rig, line_map, images())
+    on_pass(f'{len(measured.frames)} of {measured.seen} images followed under the rough rig')
+    if _usable(measured) < options.min_frames:
+        better = _from_blobs(parameters, images, measured, options)
+        measured = measure(better, line_map, images())
+        on_pass(f'{len(measured.frames)} of {measured.seen} images followed after a first '
+                'guess from the blobs of the lines')
+    if not measured.frames:
+        raise CalibrationError(_nothing(measured))
+    for _ in range(_PASSES):
+        theta = converge(parameters, measured.frames, measured.poses, options)
+        better = parameters.model(theta, with_rim=True).rig
+        measured = measure(better, line_map, images())
+        on_pass(f'{len(measured.frames)} of {measured.seen} images followed under a refined rig')
+        if len(measured.frames) <= before:
+            break
+        before = len(measured.frames)
+    if _usable(measured) == 0:
+        raise CalibrationError(_nothing(measured))
+    result = calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+    # The noise was measured with what the last rig left in the residuals; now it is clean.
+    measured = measure(result.model.rig, result.model.line_map, images())
+    return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+
+
+def _usable(measured: Measured) -> int:
+    return sum(len(frame.lines) >= _LEAST_LINES for frame in measured.frames)
+
+
+def _nothing(measured: Measured) -> str:
+    if measured.seen == 0:
+        return 'there is no image to calibrate from'
+    reason, count = measured.reasons.most_common(1)[0] if measured.reasons else ('', 0)
+    return (f'the lines could not be followed in {measured.seen} images (in {count}: {reason}); '
+            'the map, the kind of mirror or the colour of the lines is wrong, or the rough rig is '
+            'too far off')
+
+
+def _from_blobs(
+    parameters: RigParameters, images: Images, measured: Measured, options: CalibrationOptions,
+) -> Rig:
+    """A better rig from what has the lines' colour, each blob one line."""
+    rough = parameters.rough
+    frames, poses = label_blobs(rough.rig, rough.line_map, images())
+    if len(frames) < 3:
+        raise CalibrationError(_nothing(measured))
+    theta = converge(parameters, frames, poses, options)
+    return parameters.model(theta, with_rim=True).rig

@@ -1,0 +1,266 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the calibration reaches in simulation; its numbers stand in docs/calibration.md.
+
+Run it with ``python -m nccs_pose.evaluation.calibration_study targets|rough|cost``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import time
+
+from nccs_pose.calibration.adjustment import adjust
+from nccs_pose.calibration.judgement import frame_residual
+from nccs_pose.calibration.observations import FrameObservation, Observations
+from nccs_pose.calibration.parameters import RigModel, RigParameters
+from nccs_pose.calibration.prediction import predict_frame
+from nccs_pose.calibration.procedure import calibrate
+from nccs_pose.errors import CalibrationError, GeometryError
+from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.mirror import QuadricMirror
+from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, rotation_exp
+from nccs_pose.geometry.rig import Rig
+from nccs_pose.simulation.scene import arena_map, arena_rig
+from nccs_pose.simulation.table_one import look_at, TABLE_ONE
+import numpy as np
+from scipy.stats import chi2
+
+Random = np.random.Generator
+_X, _Y = 1.2, 0.8  # where the robot drives in the arena, metres either way
+
+
+def random_pose(rng: Random) -> Pose2:
+    """A pose among the lines of the arena."""
+    return Pose2(rng.uniform(-_X, _X), rng.uniform(-_Y, _Y), rng.uniform(-np.pi, np.pi))
+
+
+def measured_frames(
+    rig: Rig, line_map: LineMap, count: int, rng: Random, *, sigma: float = 0.2,
+    points: int = 75,
+) -> tuple[list[FrameObservation], Array]:
+    """Frames of noisy points on the tapes' edges, and their true poses (F, 3)."""
+    frames: list[FrameObservation] = []
+    poses: list[Array] = []
+    while len(frames) < count:
+        pose = random_pose(rng)
+        ideal = predict_frame(
+            rig, line_map, pose, sigma=sigma, points=points, stamp_ns=len(frames),
+            parameter=rng.uniform(0.0, 1.0, points))
+        if len(ideal.lines) < 3:
+            continue
+        noise = sigma * rng.normal(size=ideal.points.pixels.shape)
+        noisy = replace(ideal.points, pixels=ideal.points.pixels + noise)
+        frames.append(replace(ideal, points=noisy))
+        poses.append(pose.as_array())
+    return frames, np.array(poses)
+
+
+def _vector(rng: Random, size: int, length: float) -> Array:
+    vector = rng.normal(size=size)
+    return length * vector / np.linalg.norm(vector)
+
+
+def disturbed(
+    rig: Rig, rng: Random, *, cop: float = 3e-4, tilt: float = np.deg2rad(0.3),
+    height: float = 0.0, rig_tilt: float = 0.0,
+) -> Rig:
+    """The rig as somebody might have drawn it, off by those lengths (m) and angles (rad)."""
+    mounting = rig.T_base_mirror
+    off = np.array([0.0, 0.0, height * rng.choice([-1.0, 1.0])])
+    return replace(
+        rig, cop=rig.cop + np.array([0.0, *_vector(rng, 2, cop)]),
+        R_mirror_camera=rotation_exp(_vector(rng, 3, tilt)) @ rig.R_mirror_camera,
+        T_base_mirror=RigidTransform(
+            rotation_exp([*_vector(rng, 2, rig_tilt), 0.0]) @ mounting.rotation,
+            mounting.translation + off))
+
+
+def random_rig(kind: str, rng: Random) -> Rig:
+    """A rig like the paper's of that kind, with other sizes, camera place and mounting."""
+    like, scale = TABLE_ONE[kind], rng.uniform(0.85, 1.3)
+    mirror = QuadricMirror(
+        like.mirror.A, scale * like.mirror.B, scale**2 * like.mirror.C)
+    cop = scale * like.cop + np.array([0.0, *rng.uniform(-3e-3, 3e-3, 2)])
+    aim = rotation_exp(np.deg2rad(rng.uniform(-2.0, 2.0, 3)))
+    camera = PinholeCamera(1200, 800, 750.0, 750.0, 599.5, 399.5)
+    mounting = RigidTransform.from_rpy(
+        [np.pi + np.deg2rad(rng.uniform(-1, 1)), np.deg2rad(rng.uniform(-1, 1)),
+         rng.uniform(-np.pi, np.pi)],
+        [rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1), rng.uniform(0.6, 0.9)])
+    rotation = look_at(cop, np.array([0.0, 0.0, mirror.apex_z])) @ aim
+    return Rig(mirror, camera, cop, rotation, mounting)
+
+
+@dataclass(frozen=True)
+class Bias:
+    """Root mean square error of poses from noise-free frames: metres, radians."""
+
+    position: float
+    heading: float
+
+
+def pose_bias(used: Rig, true: Rig, line_map: LineMap, rng: Random, frames: int = 20) -> Bias:
+    """What a wrong rig does to poses of frames that no calibration has seen."""
+    model, errors = RigModel(used, line_map), []
+    for _ in range(frames):
+        pose = random_pose(rng)
+        ideal = predict_frame(true, line_map, pose, sigma=0.2)
+        if len(ideal.lines) >= 3:
+            found = Pose2.from_array(frame_residual(model, ideal, pose.as_array())[0])
+            errors.append((pose.inverse() @ found).as_array())
+    squares = np.mean(np.square(errors), axis=0)
+    return Bias(float(np.sqrt(squares[0] + squares[1])), float(np.sqrt(squares[2])))
+
+
+def deviation_of(true: Rig, parameters: RigParameters) -> Array:
+    """Theta (P,) at which the parameters' rig is the true one (default free numbers)."""
+    rough = parameters.rough.rig
+    theta = np.zeros(len(parameters))
+    turn = _rotation_vector(true.R_mirror_camera @ rough.R_mirror_camera.T)
+    tilt = _rotation_vector(true.T_base_mirror.rotation @ rough.T_base_mirror.rotation.T)
+    shift = true.T_base_mirror.translation - rough.T_base_mirror.translation
+    values = dict(zip(('cop_x', 'cop_y', 'cop_z'), true.cop - rough.cop))
+    values |= dict(zip(('camera_x', 'camera_y', 'camera_z'), turn))
+    values |= {'height': shift[2], 'tilt_x': tilt[0], 'tilt_y': tilt[1]}
+    for name, value in values.items():
+        if name in parameters.index:
+            theta[parameters.index[name]] = value
+    return theta
+
+
+def _rotation_vector(rotation: Array) -> Array:
+    skew = 0.5 * np.array([
+        rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
+        rotation[1, 0] - rotation[0, 1]])
+    sine = float(np.linalg.norm(skew))
+    return skew * (np.arcsin(min(1.0, sine)) / sine if sine > 1e-12 else 1.0)
+
+
+def squared_errors(
+    theta: Array, true: Array, information: Array, spread: Array,
+) -> tuple[float, int]:
+    """Squared errors in standard deviations over the well seen directions, and how many."""
+    scaled = information * np.outer(spread, spread)
+    values, vectors = np.linalg.eigh(scaled)
+    seen = values > 1e3
+    along = vectors[:, seen].T @ ((theta - true) / spread)
+    return float(np.sum(values[seen] * along**2)), int(seen.sum())
+
+
+def targets(kinds: Sequence[str], rigs: int) -> None:
+    """20 frames x 4 lines x 75 px at 0.2 px, starting 0.3 mm and 0.3 degrees off."""
+    line_map = arena_map()
+    for kind in kinds:
+        before, after, cop, seconds, total, freedom = [], [], [], [], 0.0, 0
+        for seed in range(rigs):
+            rng = np.random.default_rng(seed)
+            true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
+            rough = disturbed(true, rng)
+            frames, _ = measured_frames(true, line_map, 25, rng)
+            start = time.perf_counter()
+            found = calibrate(rough, line_map, frames)
+            seconds.append(time.perf_counter() - start)
+            rig, result = found.model.rig, found.adjustment
+            before.append(pose_bias(rough, true, line_map, rng).position)
+            after.append(pose_bias(rig, true, line_map, rng).position)
+            cop.append(rig.cop[1:] - true.cop[1:])
+            one, k = squared_errors(
+                result.theta, deviation_of(true, found.parameters), result.information,
+                found.parameters.spread)
+            total, freedom = total + one, freedom + k
+        low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
+        print(f'{kind}: {rigs} rigs; pose bias, median (worst) '
+              f'{1e3 * np.median(before):.0f} ({1e3 * max(before):.0f}) -> '
+              f'{1e3 * np.median(after):.3f} ({1e3 * max(after):.3f}) mm; COP rms '
+              f'{1e6 * np.sqrt(np.mean(np.square(cop), axis=0)).round(7)} um; chi2 per degree '
+              f'{total / freedom:.3f} (95 % band {low:.3f} to {high:.3f}); '
+              f'{np.median(seconds):.2f} s, worst {max(seconds):.2f} s')
+
+
+def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
+    """COP within 3 mm, tilt within 2 degrees, height within 2 cm, other rigs every time."""
+    line_map = arena_map()
+    for kind in kinds:
+        good, said, wrong, seconds = 0, 0, 0, []
+        for seed in range(first, first + rigs):
+            rng = np.random.default_rng(1000 + seed)
+            true = random_rig(kind, rng)
+            try:
+                rough = disturbed(
+                    true, rng, cop=3e-3 * np.sqrt(rng.uniform()),
+                    tilt=np.deg2rad(2.0) * rng.uniform() ** (1 / 3), height=0.02 * rng.uniform(),
+                    rig_tilt=np.deg2rad(0.15) * rng.uniform())
+                frames, _ = measured_frames(true, line_map, 25, rng)
+            except GeometryError:
+                continue
+            start = time.perf_counter()
+            try:
+                found = calibrate(rough, line_map, frames)
+            except CalibrationError as error:
+                said += 1
+                print(f'  {kind} {seed}: {error}')
+                continue
+            seconds.append(time.perf_counter() - start)
+            bias = pose_bias(found.model.rig, true, line_map, rng)
+            if bias.position < 5e-3:
+                good += 1
+            elif not found.good:
+                said += 1
+            else:
+                wrong += 1
+                print(f'  {kind} {seed}: wrong, {bias}, {found.verdict}')
+        print(f'{kind}: {good} of {good + said + wrong} found, {said} refused in words, '
+              f'{wrong} wrong and not noticed; {np.median(seconds):.1f} s, worst '
+              f'{max(seconds):.1f} s')
+
+
+def cost() -> None:
+    """Time of the adjustment alone."""
+    line_map, true = arena_map(), arena_rig()
+    for count in (20, 80, 320):
+        rng = np.random.default_rng(0)
+        frames, poses = measured_frames(true, line_map, count, rng)
+        parameters = RigParameters(disturbed(true, rng), line_map)
+        observations = Observations.stack(frames, line_map)
+        start = time.perf_counter()
+        result = adjust(parameters, observations, poses)
+        seconds = time.perf_counter() - start
+        print(f'{count} frames, {len(observations)} points: {seconds:.2f} s, '
+              f'{result.iterations} steps, {1e3 * seconds / result.iterations / count:.3f} ms '
+              'per step and frame')
+
+
+def main() -> None:
+    """Run one study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('study', choices=('targets', 'rough', 'cost'))
+    parser.add_argument('--rigs', type=int, default=50)
+    parser.add_argument('--first', type=int, default=0, help='first seed, of rough')
+    parser.add_argument('--kind', action='append', help='arena, or a rig of Table I; repeatable')
+    arguments = parser.parse_args()
+    if arguments.study == 'targets':
+        targets(arguments.kind or ['arena', *TABLE_ONE], arguments.rigs)
+    elif arguments.study == 'rough':
+        rough_starts(arguments.kind or list(TABLE_ONE), arguments.rigs, arguments.first)
+    else:
+        cost()
+
+
+if __name__ == '__main__':
+    main()
