@@ -1,0 +1,157 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Odometry between its samples against exact arcs, predictions against Monte Carlo."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry
+from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.simulation.motion import integrate_twist, Twist
+import numpy as np
+import pytest
+
+SECOND = 10**9
+START = Pose2(3.0, -2.0, 2.9)
+
+
+def _difference(a: Pose2, b: Pose2) -> tuple[float, float]:
+    return float(np.hypot(a.x - b.x, a.y - b.y)), abs(float(wrap_angle(a.yaw - b.yaw)))
+
+
+def _on_an_arc(twist: Twist, rate: float = 20.0, seconds: float = 2.0) -> Odometry:
+    odometry = Odometry()
+    for k in range(int(seconds * rate) + 1):
+        odometry.add(round(k * SECOND / rate), integrate_twist(START, twist, k / rate))
+    return odometry
+
+
+@given(forward=st.floats(-1.0, 1.0), turn=st.floats(-2.0, 2.0), t=st.floats(0.0, 2.0))
+def test_odometry_between_samples_lies_on_the_arc(forward: float, turn: float, t: float) -> None:
+    at = _on_an_arc(Twist(forward, turn)).at(round(t * SECOND))
+    assert at is not None
+    moved, turned = _difference(at, integrate_twist(START, Twist(forward, turn), t))
+    # A chord leaves its arc by its length times an eighth of its angle, 0.05 s x 1 m/s x 2 rad/s.
+    assert moved < 0.05 * 0.1 / 8 + 1e-9
+    assert turned < 1e-6
+
+
+def test_odometry_is_carried_on_a_little_past_its_last_sample() -> None:
+    twist = Twist(0.4, 0.5)
+    odometry = _on_an_arc(twist)
+    at = odometry.at(round(2.1 * SECOND))
+    assert at is not None
+    moved, turned = _difference(at, integrate_twist(START, twist, 2.1))
+    assert moved < 2e-3
+    assert turned < 1e-6
+    assert odometry.at(round(2.3 * SECOND)) is None
+
+
+def test_odometry_says_nothing_of_what_it_does_not_cover() -> None:
+    odometry = Odometry()
+    assert odometry.at(0) is None
+    odometry.add(SECOND, START)
+    assert odometry.at(SECOND) is None, 'one sample is no motion'
+    odometry.add(2 * SECOND, START @ Pose2(0.1, 0.0, 0.0))
+    assert odometry.at(SECOND // 2) is None
+    assert odometry.at(3 * SECOND // 2) is not None
+    odometry.add(10 * SECOND, START)
+    assert odometry.at(6 * SECOND) is None, 'eight seconds without a sample'
+    odometry.clear()
+    assert odometry.at(3 * SECOND // 2) is None
+
+
+def test_late_and_doubled_samples_are_no_news() -> None:
+    odometry = _on_an_arc(Twist(0.4, 0.5))
+    before = odometry.at(SECOND + 7)
+    odometry.add(SECOND, Pose2(99.0, 99.0, 0.0))
+    odometry.add(2 * SECOND, Pose2(99.0, 99.0, 0.0))
+    after = odometry.at(SECOND + 7)
+    assert before is not None and after is not None
+    assert before.as_array().tolist() == after.as_array().tolist()
+
+
+def test_odometry_kept_for_hours_answers_for_the_newest_stamps() -> None:
+    odometry = Odometry()
+    for k in range(20_000):
+        odometry.add(k * SECOND // 20, Pose2(0.01 * k, 0.0, 0.0))
+    at = odometry.at(19_990 * SECOND // 20 + SECOND // 40)
+    assert at is not None
+    assert at.x == pytest.approx(199.905, abs=1e-9)
+    assert odometry.at(SECOND) is None
+
+
+def test_a_prediction_is_right_whatever_frame_odometry_counts_in() -> None:
+    twist, dt = Twist(0.5, 0.8), 0.3
+    truth = integrate_twist(START, twist, dt)
+    origin = Pose2(-40.0, 7.0, -1.1)
+    prediction = by_odometry(
+        START, 1e-6 * np.eye(3), origin, integrate_twist(origin, twist, dt))
+    assert _difference(prediction.pose, truth) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert prediction.by_odometry
+
+
+def test_a_steady_motion_is_predicted_from_two_poses() -> None:
+    # A straight run exactly; on an arc the chord is turned once per step as well.
+    for turn, moved_limit in ((0.0, 1e-12), (0.6, 1e-3)):
+        twist = Twist(0.4, turn)
+        poses = [integrate_twist(START, twist, 0.1 * k) for k in range(3)]
+        prediction = by_velocity(
+            poses[0], 0, poses[1], 1e-6 * np.eye(3), SECOND // 10, SECOND // 5)
+        assert prediction is not None
+        moved, turned = _difference(prediction.pose, poses[2])
+        assert moved <= moved_limit
+        assert turned < 1e-9
+
+
+def test_an_old_velocity_is_not_believed() -> None:
+    args = (START, 0, START @ Pose2(0.1, 0.0, 0.0), np.eye(3))
+    assert by_velocity(*args, SECOND // 2, SECOND) is not None
+    assert by_velocity(*args, SECOND // 2, 2 * SECOND) is None
+    assert by_velocity(*args, 3 * SECOND, 3 * SECOND + 1) is None
+    assert by_velocity(*args, SECOND // 2, SECOND // 2) is None, 'no time has passed'
+
+
+def test_the_covariance_of_a_prediction_is_that_of_many_predictions() -> None:
+    rng = np.random.default_rng(5)
+    root = np.array([[0.05, 0.0, 0.0], [0.02, 0.03, 0.0], [0.02, -0.01, 0.04]])
+    covariance = root @ root.T
+    step = Pose2(1.2, 0.3, 0.7)
+    start = START.as_array() + rng.standard_normal((20_000, 3)) @ root.T
+    ends = np.array([(Pose2.from_array(row) @ step).as_array() for row in start])
+    ends[:, 2] = wrap_angle(ends[:, 2] - START.yaw)
+    origin = Pose2(0.0, 0.0, 0.0)
+    carried = by_odometry(START, covariance, origin, step).covariance
+    added = carried - by_odometry(START, 0.0 * covariance, origin, step).covariance
+    sampled = np.cov(ends.T)
+    scale = np.sqrt(np.outer(np.diag(sampled), np.diag(sampled)))
+    assert (np.abs(added - sampled) / scale).max() < 0.04
+
+
+def test_what_a_prediction_may_be_off_by_grows_with_the_motion() -> None:
+    still, zero = Pose2(0.0, 0.0, 0.0), np.zeros((3, 3))
+    sizes = [
+        np.sqrt(np.diag(by_odometry(START, zero, still, Pose2(d, 0.0, d)).covariance))
+        for d in (0.0, 0.2, 1.0)]
+    assert (np.diff(sizes, axis=0) > 0.0).all()
+    # Wheels that slip by a tenth are usual; the prediction must leave room for that.
+    assert sizes[2][0] > 0.1
+    last = START @ Pose2(0.1, 0.0, 0.0)
+    soon, later = (
+        by_velocity(START, 0, last, zero, SECOND // 2, SECOND // 2 + dt)
+        for dt in (SECOND // 10, SECOND // 2))
+    assert soon is not None and later is not None
+    assert (np.diag(later.covariance) > np.diag(soon.covariance)).all()
