@@ -21,8 +21,10 @@ from dataclasses import replace
 import io
 import math
 
+from nccs_pose.cli import main
 from nccs_pose.errors import FrameRefusedError, SimulationError
 from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation.fault_table import fault_csv, fault_table, run_fault
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.fault_list import FAULTS
@@ -235,3 +237,40 @@ def test_the_table_says_what_the_rows_say(rehearsal):
 def test_a_fault_needs_a_drive_around_it(rehearsal):
     with pytest.raises(SimulationError, match='begin at frame 8 of a drive of 5'):
         rehearse(320, 5)
+
+
+@pytest.fixture(scope='module')
+def arena_rehearsal() -> Rehearsal:
+    return rehearse(width=480, frames=18)
+
+
+@pytest.mark.parametrize('name', ['white', 'disordered', 'one_line', 'carried_2m', 'turned_180'])
+def test_the_localiser_is_not_fooled_and_comes_back(name, arena_rehearsal):
+    row = run_fault(BY_NAME[name], arena_rehearsal, Localiser)
+    assert row.wrong == 0
+    assert row.answered >= START
+    assert row.recovered is not None
+    assert row.recovered <= 3
+
+
+def test_the_command_names_faults_and_refuses_what_it_does_not_know(capsys):
+    assert main(['faults', '--list']) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert listed == list(BY_NAME)
+    for arguments, words in (
+        (['thunder'], "no fault is called 'thunder'"),
+        (['none', '--width', '641'], '--width 641'),
+        (['none', '--frames', '9'], '--frames 9'),
+    ):
+        assert main(['faults', *arguments]) == 2
+        assert words in capsys.readouterr().err
+
+
+def test_the_command_prints_and_writes_its_table(tmp_path, capsys):
+    code = main(['faults', 'black', '--width', '640', '--frames', '18', '--output', str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert (tmp_path / 'faults.md').read_text() == printed
+    (row,) = csv.DictReader((tmp_path / 'faults.csv').open())
+    assert row['fault'] == 'black'
+    assert row['frames'] == '18'
+    assert code == (1 if int(row['wrong']) else 0) == 0
