@@ -190,7 +190,8 @@ def test_a_bag_of_another_camera_is_refused(drive: Path, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(('change', 'words'), [
     (lambda a: [*a, '--option', 'nonsense=1'], ['nonsense', 'there are']),
-    (lambda a: [*a, '--option', 'method=guess'], ['method', 'guess', 'paper']),
+    (lambda a: [*a, '--option', 'threshold=guess'], ['threshold', 'guess', 'hsv']),
+    (lambda a: [*a, '--option', 'stations=many'], ['stations=many', 'int']),
     (lambda a: [*a, '--output', str(REPO)], [str(REPO), 'folder']),
     (lambda a: [*a, '--image-topic', '/odom'], ['/odom', 'nav_msgs/msg/Odometry']),
     (lambda a: [*a, '--map', 'absent.yaml'], ['absent.yaml']),
@@ -209,35 +210,36 @@ def test_wrong_input_ends_in_one_sentence(
 
 @pytest.mark.parametrize('name', ['arena.yaml', 'robot.yaml', 'room.yaml'])
 def test_the_node_s_parameter_files_configure_a_replay(name: str) -> None:
-    assert make_options(None, REPO / 'config' / name, []) == LocaliserOptions()
+    assert make_options(REPO / 'config' / name, []) == LocaliserOptions()
 
 
-def test_options_come_from_file_setting_and_method_in_this_order(tmp_path: Path) -> None:
+def test_options_come_from_the_file_and_then_from_settings(tmp_path: Path) -> None:
     number = next(f for f in dataclasses.fields(LocaliserOptions)
                   if isinstance(f.default, float) and f.metadata['low'] is not None)
     low = number.metadata['low']
     path = tmp_path / 'params.yaml'
     path.write_text(f"""
 /**:
-  ros__parameters: {{method: paper}}
+  ros__parameters: {{threshold: hsv}}
 /robot/localiser:
   ros__parameters: {{{number.name}: {low}, rig_file: x.yaml, use_sim_time: true}}
 talker:
   ros__parameters: {{nonsense: 1}}
 """)
-    options = make_options(None, path, [])
-    assert (options.method, getattr(options, number.name)) == ('paper', low)
-    given = make_options('nccs', path, [f'{number.name}={number.default}', 'method=paper'])
+    options = make_options(path, [])
+    assert (options.threshold, getattr(options, number.name)) == ('hsv', low)
+    given = make_options(
+        path, [f'{number.name}={number.default}', 'threshold=chromaticity'])
     assert given == LocaliserOptions()
     path.write_text(path.read_text().replace('rig_file', 'rig_fil'))
     with pytest.raises(FileError, match=r'params\.yaml: rig_fil '):
-        make_options(None, path, [])
+        make_options(path, [])
     path.write_text(f'localiser: {{ros__parameters: {{{number.name}: {low - 1}}}}}')
     with pytest.raises(FileError, match=rf'params\.yaml: {number.name} = '):
-        make_options(None, path, [])
+        make_options(path, [])
     path.write_text('talker: {ros__parameters: {}}')
     with pytest.raises(FileError, match=r'params\.yaml: localiser is missing'):
-        make_options(None, path, [])
+        make_options(path, [])
 
 
 def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture) -> None:

@@ -28,10 +28,8 @@ from nccs_pose.ros.node_options import NodeOptions
 _FIELDS = {field.name: field for field in dataclasses.fields(LocaliserOptions)}
 
 
-def make_options(
-    method: str | None, parameter_file: Path | None, settings: Iterable[str],
-) -> LocaliserOptions:
-    """Options of the localiser: its defaults, a parameter file, `--option`s, `--method`.
+def make_options(parameter_file: Path | None, settings: Iterable[str]) -> LocaliserOptions:
+    """Options of the localiser: its defaults, then a parameter file, then `--option`s.
 
     :param settings: ``NAME=VALUE``.
     :raises FileError: if an option is not known or its value is not accepted.
@@ -46,8 +44,6 @@ def make_options(
                 f'--option {setting}: there is no option {name!r}; there are '
                 f'{", ".join(_FIELDS)}.')
         values[name] = _parse(setting, text, _FIELDS[name].default)
-    if method is not None:
-        values['method'] = method
     try:
         return LocaliserOptions(**values)
     except OptionError as error:

@@ -20,16 +20,25 @@ from dataclasses import dataclass
 import json
 import math
 import time
-from typing import Any
+from typing import Any, Protocol
 
 from nccs_pose.errors import FrameRefusedError, NccsPoseError, VisionError
 from nccs_pose.estimation.estimate import Estimate, Quality
-from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.decode import Image
 import numpy as np
+
+
+class Answering(Protocol):
+    """What a localiser must be able to do to be replayed."""
+
+    def process(self, stamp_ns: int, image: Image) -> Estimate:
+        """Answer an image; may refuse it with one of the project's errors."""
+
+    def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
+        """Take notice of the wheels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +68,7 @@ OnFrame = Callable[[FrameRecord, Image | None], None]
 
 
 def run_events(
-    localiser: Localiser, events: Iterable[BagEvent], on_frame: OnFrame,
+    localiser: Answering, events: Iterable[BagEvent], on_frame: OnFrame,
 ) -> list[FrameRecord]:
     """Feed images and odometry in their order.
 
@@ -79,12 +88,14 @@ def run_events(
     return records
 
 
-def answered_poses(records: list[FrameRecord]) -> tuple[Trajectory, Array]:
-    """Poses of the answered frames, and their covariances (N, 3, 3)."""
+def answered_poses(records: list[FrameRecord]) -> tuple[Trajectory, Array | None]:
+    """Poses of the answered frames, and their covariances (N, 3, 3); None if they have none."""
     answers = [r.estimate for r in records if r.answered and r.estimate is not None]
     trajectory = Trajectory(
         np.array([estimate.stamp_ns for estimate in answers], dtype=np.int64),
         np.array([e.pose.as_array() for e in answers if e.pose is not None]))
+    if any(estimate.covariance is None for estimate in answers):
+        return trajectory, None
     covariances = np.array([estimate.covariance for estimate in answers], dtype=float)
     return trajectory, covariances.reshape(-1, 3, 3)
 
@@ -110,7 +121,7 @@ def record_line(record: FrameRecord) -> str:
 
 
 def _run_image(
-    localiser: Localiser, event: StampedImage, index: int,
+    localiser: Answering, event: StampedImage, index: int,
 ) -> tuple[FrameRecord, Image | None]:
     try:
         image = event.decode()

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Callable
 import dataclasses
 import json
 from pathlib import Path
@@ -26,10 +27,12 @@ from typing import Any
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.offline_run import (
     answered_poses,
+    Answering,
     FrameRecord,
     record_line,
     run_events,
 )
+from nccs_pose.cli.paper_localiser import PaperLocaliser
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
 from nccs_pose.estimation.estimate import StageTimes
@@ -51,10 +54,13 @@ from nccs_pose.files.trajectories import write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Pose2
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.vision.decode import Image
 import numpy as np
+
+_METHODS: dict[str, Callable[[Rig, LineMap, LocaliserOptions], Answering]] = {
+    'nccs': Localiser, 'paper': PaperLocaliser}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,8 +77,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--overlays', type=int, default=6, metavar='N',
         help='images to draw detections and prediction on, with --plots (default %(default)s)')
     parser.add_argument(
-        '--method', choices=('nccs', 'paper'),
-        help="nccs: this project's estimator (default); paper: the published one")
+        '--method', choices=sorted(_METHODS), default='nccs',
+        help="nccs: this project's localiser (default); paper: the published chain, started and "
+             'its blobs told apart by the project')
     parser.add_argument(
         '--params', type=Path, metavar='FILE',
         help='ROS parameter file of the node, for the options of its localiser')
@@ -88,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
-    options = make_options(args.method, args.params, args.option)
+    options = make_options(args.params, args.option)
     check_writable(args.output)
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
@@ -103,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
                 progress.step(record.estimate.state.value if record.estimate else 'refused')
 
             records = run_events(
-                Localiser(rig, line_map, options),
+                _METHODS[args.method](rig, line_map, options),
                 bag.events(odometry=not args.no_odometry), on_frame)
         used = dataclasses.asdict(bag.topics)
     estimated, covariances = answered_poses(records)
@@ -172,20 +179,21 @@ class _Overlays:
 
 def _evaluate(
     args: argparse.Namespace, records: list[FrameRecord], estimated: Trajectory,
-    covariances: np.ndarray, truth: Trajectory, line_map: LineMap,
+    covariances: Array | None, truth: Trajectory, line_map: LineMap,
 ) -> None:
     errors = compare(estimated, truth)
     summary = summarise(errors, frames=len(records), answered=len(estimated))
-    trust = consistency(errors.error, covariances[errors.index])
+    matched = None if covariances is None else covariances[errors.index]
+    trust = None if matched is None else consistency(errors.error, matched)
     write_text(
         _beside(args.output, 'evaluation.json'),
         json.dumps(as_numbers(summary, trust), indent=2) + '\n')
     print(summary_table(summary))
-    if trust.count:
+    if trust is not None and trust.count:
         print(consistency_table(trust))
     if args.plots:
         _draw_trajectory(args, estimated, truth, line_map)
-        _draw_errors(args, errors, covariances[errors.index])
+        _draw_errors(args, errors, matched)
 
 
 def _draw_trajectory(
@@ -198,7 +206,9 @@ def _draw_trajectory(
         args.plots / 'trajectory.png')
 
 
-def _draw_errors(args: argparse.Namespace, errors: PoseErrors, covariances: np.ndarray) -> None:
+def _draw_errors(
+    args: argparse.Namespace, errors: PoseErrors, covariances: Array | None,
+) -> None:
     from nccs_pose.evaluation.plots import error_figure, histogram_figure
 
     save_figure(error_figure(errors, covariances, str(args.bag)), args.plots / 'errors.png')
@@ -225,7 +235,7 @@ def _print_states(records: list[FrameRecord]) -> None:
 def _used(args: argparse.Namespace, options: LocaliserOptions, topics: dict[str, Any]) -> str:
     """What the run used, the files' own text included."""
     return json.dumps({
-        'command': 'replay', 'bag': str(args.bag), 'topics': topics,
+        'command': 'replay', 'method': args.method, 'bag': str(args.bag), 'topics': topics,
         'odometry': not args.no_odometry, 'options': dataclasses.asdict(options),
         'rig': {'file': str(args.rig), 'text': args.rig.read_text(encoding='utf-8')},
         'map': {'file': str(args.map), 'text': args.map.read_text(encoding='utf-8')},
