@@ -19,10 +19,6 @@ from __future__ import annotations
 import cv2
 from hypothesis import given
 from hypothesis import strategies as st
-import numpy as np
-import pytest
-from scipy.spatial.transform import Rotation
-
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry import (
     Line,
@@ -36,6 +32,9 @@ from nccs_pose.geometry import (
 )
 from nccs_pose.geometry.pose import rotation_exp
 from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
 finite = st.floats(-5.0, 5.0)
 angles = st.floats(-10.0, 10.0)

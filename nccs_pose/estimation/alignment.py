@@ -35,8 +35,9 @@ from numpy.typing import NDArray
 # A profile is linear in its shift for about so many pixels.
 _LINEAR_PX = 2.0
 _ITERATIONS = 8
-# Poses that differ by less than this predict the same bands, metres and rad.
-_SETTLED = (5e-4, 5e-4)
+# A measured shift is right to a fifth or better: the poses have settled when the last step was
+# below one standard deviation of what was measured.
+_SETTLED = 1.0
 _LEAST_STATIONS = 12
 # Neighbours that may share one cause of error (a shade, a tile, a block of JPEG).
 _BLOCK = 12
@@ -73,7 +74,7 @@ class Aligner:
         self._options = options
         names = tuple(dict.fromkeys(line.colour for line in line_map))
         self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
-        self.nominal_colours = tuple(LineColour.nominal(name) for name in names)
+        self.nominal_colours = tuple(LineColour.nominal(name, options.blur) for name in names)
 
     def align(
         self,
@@ -108,9 +109,9 @@ class Aligner:
             result = self._solve(bands, fit, pose, prior, colours)
             if result is None:
                 return None
-            step = pose.inverse() @ result.pose
+            settled = close(result.pose, pose, result.covariance, _SETTLED)
             pose = result.pose
-            if np.hypot(step.x, step.y) < _SETTLED[0] and abs(step.yaw) < _SETTLED[1]:
+            if settled:
                 return result
         return None
 
@@ -122,7 +123,7 @@ class Aligner:
     ) -> tuple[ProfileFit, tuple[LineColour, ...]]:
         """Fit the bands of each colour with that colour."""
         if len(colours) == 1:
-            fit, learned = fit_profiles(image, bands, colours[0], self._options.blur)
+            fit, learned = fit_profiles(image, bands, colours[0])
             return fit, (learned,)
         n = len(bands)
         shift, sigma, contrast = np.zeros(n), np.ones(n), np.zeros(n)
@@ -131,7 +132,7 @@ class Aligner:
         for k, colour in enumerate(colours):
             own = self._colour_of_line[bands.label] == k
             if own.any():
-                fit, learned_all[k] = fit_profiles(image, bands[own], colour, self._options.blur)
+                fit, learned_all[k] = fit_profiles(image, bands[own], colour)
                 shift[own], sigma[own], contrast[own] = fit.shift, fit.sigma, fit.contrast
                 found[own] = fit.found
         return ProfileFit(shift, sigma, contrast, found), tuple(learned_all)
@@ -146,7 +147,7 @@ class Aligner:
             own = bands[self._colour_of_line[bands.label] == k]
             if len(own) < _LEAST_STATIONS:
                 continue
-            fit = search_profiles(image, own, colour, self._options.blur, reach)
+            fit = search_profiles(image, own, colour, reach)
             moved = own.midline + fit.shift[:, None] * own.across
             pixels.append(moved[fit.found])
             labels.append(own.label[fit.found])

@@ -50,7 +50,7 @@ class LocaliserOptions:
         doc='Points measured on each line (the paper takes 75).')
     blur: float = option(
         0.7, unit='px', low=0.2, high=5.0, live=True,
-        doc='Blur of an edge in the image, standard deviation.')
+        doc='Blur of an edge in the image, standard deviation: a start, each image says its own.')
     band: float = option(
         12.0, unit='px', low=3.0, high=100.0, live=True,
         doc='How far beside its predicted curve a line is searched while tracking.')

@@ -16,10 +16,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.residual import whitened_residual, whitened_residual_with_attitude
+from nccs_pose.estimation.side_form import SideForm
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -31,7 +31,7 @@ _CAUCHY = 2.385
 _GATE = 3.0
 # Where the lines say nothing the pose is still somewhere within 100 m and 10 rad: this keeps
 # every covariance finite and positive definite, and is too weak to move any pose.
-_VAGUE_INFORMATION = (1e-4, 1e-4, 1e-2)
+_VAGUE_INFORMATION = np.diag([1e-4, 1e-4, 1e-2, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,27 +60,14 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Pixels, lines, their noise, and what is known of the unknowns beforehand.
+    """Pixels on their lines, and what is known of the unknowns beforehand.
 
     The unknowns are (x, y, yaw), followed by (z, roll, pitch) where those are free.
     """
 
-    rays: Rays
-    directions: Array
-    moments: Array
-    sigma: Array
-    sigma_world: float
+    form: SideForm
     expected: Array
     information: Array
-
-    def residual(self, unknowns: Array) -> tuple[Array, Array]:
-        pose = Pose2.from_array(unknowns[:3])
-        if len(unknowns) == 3:
-            return whitened_residual(
-                self.rays, self.directions, self.moments, pose, self.sigma, self.sigma_world)
-        return whitened_residual_with_attitude(
-            self.rays, self.directions, self.moments, pose, unknowns[3:], self.sigma,
-            self.sigma_world)
 
     def deviation(self, unknowns: Array) -> Array:
         difference = unknowns - self.expected
@@ -88,15 +75,10 @@ class _Problem:
         return difference
 
     def cost(self, e: Array, width: float, unknowns: Array) -> float:
-        """Cauchy's loss of the residuals, or their squares for an infinite width, and the prior."""
+        """Cauchy's loss of the residuals (their squares at infinite width), and the prior."""
         loss = e @ e if np.isinf(width) else width**2 * np.log1p((e / width) ** 2).sum()
         deviation = self.deviation(unknowns)
         return float(loss + deviation @ self.information @ deviation)
-
-    def of(self, chosen: NDArray[np.bool_]) -> _Problem:
-        return _Problem(
-            self.rays[chosen], self.directions[chosen], self.moments[chosen], self.sigma[chosen],
-            self.sigma_world, self.expected, self.information)
 
 
 def refine(
@@ -136,23 +118,25 @@ def refine(
         raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
     sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
     expected, known = _prior(start, prior, attitude_sigma)
-    problem = _Problem(rays, directions, moments, sigma, sigma_world, expected, known)
+    form = SideForm(rays, directions, moments, sigma, sigma_world, len(expected) == 6)
+    problem = _Problem(form, expected, known)
     unknowns = np.concatenate([start.as_array(), expected[3:]])
     inlier, scale, converged = np.ones(len(rays), dtype=bool), 1.0, True
     if robust:
         unknowns, converged = _descend(problem, unknowns, True, max_iterations)
-        e, _ = problem.residual(unknowns)
+        e, _ = form.residual(unknowns)
         scale = _robust_scale(e)
         inlier = np.abs(e) <= _GATE * scale
-    unknowns, finished = _descend(problem.of(inlier), unknowns, False, max_iterations)
-    e, jacobian = problem.residual(unknowns)
+    trusted = replace(problem, form=form.of(inlier))
+    unknowns, finished = _descend(trusted, unknowns, False, max_iterations)
+    e, jacobian = form.residual(unknowns)
     normal = jacobian[inlier].T @ jacobian[inlier]
     # Residuals larger than the noise was told to be widen the claim; smaller ones do not
     # narrow it.
     degrees = max(1, int(inlier.sum()) - 3)
     inflation = float(e[inlier] @ e[inlier]) / degrees
     inflation = max(1.0, inflation) if noise_known else max(1e-6, inflation)
-    covariance = np.linalg.inv(normal / inflation + known)[:3, :3]
+    covariance = np.linalg.inv(normal / inflation + known + _vague(len(known)))[:3, :3]
     attitude = unknowns[3:] if len(unknowns) == 6 else np.zeros(3)
     return Refinement(
         Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
@@ -170,13 +154,15 @@ def _prior(
     expected[:3] = start.as_array() if prior is None else prior[0].as_array()
     if prior is not None:
         information[:3, :3] = np.linalg.inv(prior[1])
-    else:
-        information[:3, :3] = np.diag(_VAGUE_INFORMATION)
     if free:
         # A tenth of a micrometre and of a microradian stand for 'held'.
         information[3, 3] = 1.0 / max(height, 1e-7) ** 2
         information[4, 4] = information[5, 5] = 1.0 / max(tilt, 1e-7) ** 2
     return expected, information
+
+
+def _vague(size: int) -> Array:
+    return _VAGUE_INFORMATION[:size, :size]
 
 
 def _robust_scale(e: Array) -> float:
@@ -189,23 +175,25 @@ def _descend(
 ) -> tuple[Array, bool]:
     """Levenberg-Marquardt; returns where it ends and whether it converged."""
     damping = 0.0
-    e, jacobian = problem.residual(unknowns)
+    e, jacobian = problem.form.residual(unknowns)
     for _ in range(max_iterations):
         width = _CAUCHY * _robust_scale(e) if cauchy else np.inf
         weight = 1.0 / (1.0 + (e / width) ** 2)
-        normal = (jacobian * weight[:, None]).T @ jacobian + problem.information
+        normal = ((jacobian * weight[:, None]).T @ jacobian + problem.information
+                  + _vague(len(unknowns)))
         slope = (jacobian.T @ (weight * e)
                  + problem.information @ problem.deviation(unknowns))
         step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
         trial = unknowns + step
-        e_trial, jacobian_trial = problem.residual(trial)
+        e_trial, jacobian_trial = problem.form.residual(trial)
         if problem.cost(e_trial, width, trial) <= problem.cost(e, width, unknowns):
             unknowns, e, jacobian = trial, e_trial, jacobian_trial
             damping *= 0.1 if damping > 1e-6 else 0.0
         else:
             damping = max(1e-3, 10.0 * damping)
-        # A step far below what the pixels can tell ends the search.
-        if float(step @ normal @ step) < 1e-10:
+        # A step far below what the pixels can tell ends the search; the robust stage only has to
+        # find the inliers.
+        if float(step @ normal @ step) < (1e-4 if cauchy else 1e-10):
             return unknowns, True
         if damping > 1e8:
             return unknowns, False

@@ -25,10 +25,9 @@ Rays are in base_link, lines in the map; the pose is T_map_base.
 
 from __future__ import annotations
 
-import numpy as np
-
-from nccs_pose.geometry.pose import Array, Pose2, rotation_exp
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
+import numpy as np
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -75,36 +74,6 @@ def whitened_residual(
     :param sigma_world: standard deviation of the lines' own position across themselves, metres.
     :returns: e (N,), no unit, and de/d(x, y, yaw) (N, 3), exact.
     """
-    e, jacobian, _ = _whiten(rays, directions, moments, pose, sigma, sigma_world)
-    return e, jacobian
-
-
-def whitened_residual_with_attitude(
-    rays: Rays,
-    directions: Array,
-    moments: Array,
-    pose: Pose2,
-    attitude: Array,
-    sigma: Array | float = 1.0,
-    sigma_world: float = 0.0,
-) -> tuple[Array, Array]:
-    """As :func:`whitened_residual`, for a base that has left its plane a little.
-
-    :param attitude: height z and small roll and pitch of base_link (3,); m, rad, rad.
-    :returns: e (N,), and its Jacobian by (x, y, yaw, z, roll, pitch) (N, 6); in the last three
-        the change of the weight is left out, which costs convergence and no accuracy.
-    """
-    rays = tilted(rays, attitude)
-    e, jacobian, scale = _whiten(rays, directions, moments, pose, sigma, sigma_world)
-    by_attitude = scale[:, None] * attitude_jacobian(rays, directions, moments, pose)
-    return e, np.concatenate([jacobian, by_attitude], axis=1)
-
-
-def _whiten(
-    rays: Rays, directions: Array, moments: Array, pose: Pose2, sigma: Array | float,
-    sigma_world: float,
-) -> tuple[Array, Array, Array]:
-    """Whitened residuals (N,), their Jacobian (N, 3), and 1 / standard deviation of S (N,)."""
     rotation = pose.rotation
     d, mu = lines_in_base(directions, moments, pose)
     # d and mu turn with the pose: d(R^T a)/dyaw = -z x (R^T a), dmu'/dp = R^T (d x e).
@@ -132,33 +101,7 @@ def _whiten(
     scale = 1.0 / np.sqrt(variance)
     e = s * scale
     jacobian = scale[:, None] * (s_pose - (s / variance)[:, None] * half_slope)
-    return e, jacobian, scale
-
-
-def attitude_jacobian(
-    rays: Rays, directions: Array, moments: Array, pose: Pose2,
-) -> Array:
-    """dS/d(z, roll, pitch) (N, 3) of a base that heaves and tilts off its plane.
-
-    Moving the rays by (rho, omega) in base_link changes S by
-    rho . (r x d') + omega . (r x mu' + w x d').
-    """
-    d, mu = lines_in_base(directions, moments, pose)
-    lift = np.cross(rays.direction, d)[:, 2]
-    turn = np.cross(rays.direction, mu) + np.cross(rays.moment, d)
-    return np.column_stack([lift, turn[:, :2]])
-
-
-def tilted(rays: Rays, attitude: Array) -> Rays:
-    """The rays of a base at height z with small roll and pitch (3,): m, rad, rad."""
-    z, roll, pitch = attitude
-    rotation = rotation_exp([roll, pitch, 0.0])
-    lift = np.array([0.0, 0.0, z])
-    r, dr = rays.direction @ rotation.T, np.matmul(rotation, rays.direction_jacobian)
-    w = rays.moment @ rotation.T + np.cross(lift, r)
-    dw = (np.matmul(rotation, rays.moment_jacobian)
-          + np.cross(lift[None, :, None], dr, axis=1))
-    return Rays(r, w, dr, dw, rays.hit)
+    return e, jacobian
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What sets a tape apart from the floor: a contrast in colour, learned as the robot drives."""
+"""How a tape looks: its contrast to the floor and its edges' blur, learned as they are seen."""
 
 from __future__ import annotations
 
@@ -36,6 +36,9 @@ CONTRASTS: dict[str, tuple[float, float, float]] = {
 }
 # A learned contrast further than this from its class is no longer that colour.
 _DRIFT_COSINE = 0.5
+# Blur that an image can have, px, and how far one image may change it.
+_BLUR_RANGE = (0.35, 3.0)
+_BLUR_STEP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +48,16 @@ class LineColour:
     :ivar name: colour class, a key of :data:`CONTRASTS`.
     :ivar contrast: tape minus floor (3,) in B, G, R, grey levels.
     :ivar clutter: covariance (3, 3) of what is no tape: noise, texture, shade; grey levels^2.
+    :ivar blur: standard deviation of an edge's blur by lens, motion and pixel, px.
     """
 
     name: str
     contrast: Array
     clutter: Array
+    blur: float
 
     @classmethod
-    def nominal(cls, name: str) -> LineColour:
+    def nominal(cls, name: str, blur: float) -> LineColour:
         """The class's own contrast, before any image is seen.
 
         :raises VisionError: if the class is unknown.
@@ -62,7 +67,8 @@ class LineColour:
         direction = np.array(CONTRASTS[name])
         # A coloured tape is told by chromaticity: brightness is what the floor varies in.
         grey = np.full((3, 3), 20.0**2) if abs(direction.sum()) < 1e-9 else np.zeros((3, 3))
-        return cls(name, 60.0 * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3))
+        return cls(name, 60.0 * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3),
+                   blur)
 
     @cached_property
     def discriminant(self) -> Array:
@@ -94,3 +100,21 @@ class LineColour:
         # One grey level of rounding keeps a noise-free image from a singular covariance.
         clutter += 0.1 * np.eye(3)
         return replace(self, contrast=contrast, clutter=clutter)
+
+    def sharpen(self, values: Array, height: Array, soften: Array) -> LineColour:
+        """Take over the blur seen at N stations.
+
+        A profile that is softer than its template leaves a residual along dT/d(blur), in
+        proportion to its contrast; all stations together tell how much.
+
+        :param values: samples (N, K, 3).
+        :param height: contrast per station (N, 3).
+        :param soften: dT/d(blur) (N, K), orthogonal to floor and template.
+        """
+        along = np.maximum(height @ self.discriminant, 0.0)
+        left = np.einsum('nk,nkc,c->n', soften, values, self.discriminant)
+        power = (along**2 * (soften * soften).sum(axis=1)).sum()
+        if power < 1e-9:
+            return self
+        step = float(np.clip((along * left).sum() / power, -_BLUR_STEP, _BLUR_STEP))
+        return replace(self, blur=float(np.clip(self.blur + step, *_BLUR_RANGE)))

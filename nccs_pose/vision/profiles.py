@@ -42,6 +42,8 @@ _MARGIN = 4.5
 _HALF_SAMPLES = 12
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
 _CONTRAST_SPREAD = 0.2
+# The blur is learned from bands that lie this well on their tapes, px.
+_SHARP_PX = 0.3
 # A line whose contrast is this many standard deviations above nothing is there.
 _FOUND = 6.0
 # A line this much fainter than its colour's contrast, or a station than its line, is not.
@@ -82,25 +84,28 @@ def sample(image: NDArray[np.uint8], bands: Bands, offsets: Array) -> Array:
 
 
 def fit_profiles(
-    image: NDArray[np.uint8], bands: Bands, colour: LineColour, blur: float,
+    image: NDArray[np.uint8], bands: Bands, colour: LineColour,
 ) -> tuple[ProfileFit, LineColour]:
-    """Fit each station's profile, and learn the colour that tells tape from floor.
+    """Fit each station's profile, and learn how tapes look in this image.
 
     The samples lie symmetrically about the middle of the edges, so the even unknowns (floor b,
     contrast a) and the odd ones (slope b1, shift a delta) separate.
 
     :param image: (H, W, 3) BGR.
-    :param colour: what the tapes' contrast is expected to be.
-    :param blur: standard deviation of the edge's blur, px.
+    :param colour: what the tapes' contrast and blur are expected to be.
     """
+    blur = colour.blur
     spread = np.maximum(1.0, (bands.half_width + _MARGIN) / _HALF_SAMPLES)
     s = spread[:, None] * np.arange(-_HALF_SAMPLES, _HALF_SAMPLES + 1)
     used = (np.abs(s) <= bands.half_width[:, None] + _MARGIN).astype(float)
     values = sample(image, bands, s).astype(float)
     left, right = (s + bands.half_width[:, None]) / blur, (s - bands.half_width[:, None]) / blur
     box = (ndtr(left) - ndtr(right)) * used
-    # d/d(delta) of T(s - delta).
-    slide = (np.exp(-0.5 * right**2) - np.exp(-0.5 * left**2)) / (blur * np.sqrt(2 * np.pi)) * used
+    at_left, at_right = (np.exp(-0.5 * edge**2) * used / (blur * np.sqrt(2 * np.pi))
+                         for edge in (left, right))
+    # d/d(delta) of T(s - delta), and dT/d(blur).
+    slide = at_right - at_left
+    soften = right * at_right - left * at_left
     count = used.sum(axis=1, keepdims=True)
     even = box - used * (box.sum(axis=1, keepdims=True) / count)
     ramp = s * used
@@ -120,7 +125,13 @@ def fit_profiles(
     mean = np.einsum('nk,nkc->nc', beside, values) / beside.sum(axis=1, keepdims=True)
     clutter = beside[..., None] * (values - mean[:, None])
     colour = colour.learn(height, even_power, clutter, beside)
-    return _shifts(bands, colour, height, moved, even_power, odd_power, residual, count), colour
+    soften -= used * (soften.sum(axis=1, keepdims=True) / count)
+    soften -= even * ((soften * even).sum(axis=1) / even_power)[:, None]
+    fit = _shifts(bands, colour, height, moved, even_power, odd_power, residual, count)
+    # A template beside its tape would take the misfit for blur.
+    if float(np.median(np.abs(fit.shift))) < _SHARP_PX:
+        colour = colour.sharpen(values, height, soften)
+    return fit, colour
 
 
 def _shifts(
@@ -158,7 +169,7 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 
 def search_profiles(
-    image: NDArray[np.uint8], bands: Bands, colour: LineColour, blur: float, reach: float,
+    image: NDArray[np.uint8], bands: Bands, colour: LineColour, reach: float,
 ) -> ProfileFit:
     """The best match of each station's profile anywhere within ``reach`` pixels across.
 
@@ -171,7 +182,7 @@ def search_profiles(
     feature = sample(image, bands, s).astype(float) @ colour.discriminant
     k = np.arange(-kernel_half, kernel_half + 1.0)
     wide = bands.half_width[:, None]
-    box = ndtr((k + wide) / blur) - ndtr((k - wide) / blur)
+    box = ndtr((k + wide) / colour.blur) - ndtr((k - wide) / colour.blur)
     box -= box.mean(axis=1, keepdims=True)
     power = np.maximum((box * box).sum(axis=1), 1e-9)
     windows = np.lib.stride_tricks.sliding_window_view(feature, len(k), axis=1)

@@ -1,0 +1,98 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The residual of many pixels, prepared once and evaluated at many poses.
+
+S is linear in the ray (r, w) and in seven monomials of the pose. So are its derivatives by the
+pixel, by the base's height, roll and pitch, and the cosine between ray and line: each is S of
+another ray. All are rows of one array, and a pose costs one small matrix product.
+"""
+
+from __future__ import annotations
+
+from nccs_pose.estimation.pose_monomials import monomial_rows, monomials, monomials_jacobian
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.rig import Rays
+import numpy as np
+
+
+class SideForm:
+    """Whitened residuals of N rays against N lines, as functions of pose and attitude."""
+
+    def __init__(
+        self, rays: Rays, directions: Array, moments: Array, sigma: Array, sigma_world: float,
+        with_attitude: bool,
+    ) -> None:
+        """Prepare the rows.
+
+        :param directions: unit directions of the lines in the map (N, 3).
+        :param moments: their moments (N, 3), metres.
+        :param sigma: standard deviation of the pixels along the curve's normal, px (N,).
+        :param sigma_world: standard deviation of the lines' own position, metres.
+        :param with_attitude: whether height, roll and pitch are unknowns too.
+        """
+        r, w = rays.direction, rays.moment
+        ray = [r, rays.direction_jacobian[:, :, 0], rays.direction_jacobian[:, :, 1]]
+        moment = [w, rays.moment_jacobian[:, :, 0], rays.moment_jacobian[:, :, 1]]
+        zero = np.zeros(len(r))
+        if with_attitude:
+            # A base that rises or turns by a little moves its rays: w by e_z x r; r and w by
+            # e_x x, and by e_y x.
+            ray += [np.zeros_like(r), np.column_stack([zero, -r[:, 2], r[:, 1]]),
+                    np.column_stack([r[:, 2], zero, -r[:, 0]])]
+            moment += [np.column_stack([-r[:, 1], r[:, 0], zero]),
+                       np.column_stack([zero, -w[:, 2], w[:, 1]]),
+                       np.column_stack([w[:, 2], zero, -w[:, 0]])]
+        if sigma_world > 0.0:
+            ray.append(np.zeros_like(r))
+            moment.append(r)
+        self._rows = monomial_rows(np.array(ray), np.array(moment), directions, moments)
+        self._variance = np.square(sigma)
+        self._world_variance = sigma_world**2
+        self._with_attitude = with_attitude
+
+    def residual(self, unknowns: Array) -> tuple[Array, Array]:
+        """Residuals e (N,) and their Jacobian (N, 3), or (N, 6) with the attitude.
+
+        e = S / sqrt(sigma^2 |dS/du|^2 + sigma_w^2 |r x d|^2). The attitude is small: S is taken
+        as linear in it, and its effect on the weight is left out.
+
+        :param unknowns: (x, y, yaw), followed by (z, roll, pitch) with the attitude.
+        """
+        pose = Pose2(*unknowns[:3])
+        values = self._rows @ np.column_stack([monomials(pose), monomials_jacobian(pose)])
+        s, gradient = values[0], values[1:3]
+        variance = self._variance * np.square(gradient[:, :, 0]).sum(axis=0)
+        half_slope = self._variance[:, None] * np.einsum(
+            'kn,knp->np', gradient[:, :, 0], gradient[:, :, 1:])
+        if self._world_variance > 0.0:
+            cosine = values[-1]
+            variance = variance + self._world_variance * (1.0 - np.square(cosine[:, 0]))
+            half_slope -= self._world_variance * cosine[:, :1] * cosine[:, 1:]
+        # A ray along the line, or a pixel where nothing changes, has no distance to tell.
+        variance = np.maximum(variance, 1e-30)
+        scale = 1.0 / np.sqrt(variance)
+        by_attitude = values[3:6, :, 0].T if self._with_attitude else np.zeros((len(scale), 0))
+        numerator = s[:, 0] + by_attitude @ unknowns[3:]
+        jacobian = np.concatenate(
+            [s[:, 1:] - (numerator / variance)[:, None] * half_slope, by_attitude], axis=1)
+        return numerator * scale, scale[:, None] * jacobian
+
+    def of(self, chosen: Array) -> SideForm:
+        """The same for some of the pixels."""
+        part = object.__new__(SideForm)
+        part.__dict__.update(self.__dict__)
+        part._rows = self._rows[:, chosen]
+        part._variance = self._variance[chosen]
+        return part
