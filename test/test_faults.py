@@ -25,7 +25,7 @@ from nccs_pose.cli import main
 from nccs_pose.errors import FrameRefusedError, SimulationError
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.evaluation.fault_table import fault_csv, fault_table, run_fault
+from nccs_pose.evaluation.fault_table import combine, fault_csv, fault_table, run_fault
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.fault_list import FAULTS
 from nccs_pose.simulation.faults import prepare, Rehearsal, rehearse
@@ -234,6 +234,24 @@ def test_the_table_says_what_the_rows_say(rehearsal):
     assert second['recovered_after'] == ''
 
 
+def test_drives_add_up_and_the_worst_counts(rehearsal):
+    def late(k, pose):
+        return None if k < STOP + 3 else (pose, 0.001)
+
+    quick, slow = score(rehearsal, beside(0.06, 0.1), 'black'), score(rehearsal, late, 'black')
+    both = combine([replace(quick, recovered=1), slow])
+    assert (both.frames, both.answered, both.lost, both.wrong) == (40, 21, 19, 0)
+    assert both.recovered == 4
+    assert both.worst_distance == pytest.approx(0.06)
+    assert combine([quick, slow]).recovered is None
+
+
+def test_every_track_stays_in_the_arena_when_the_robot_is_carried():
+    for seed in range(4):
+        play = prepare(BY_NAME['carried_2m'], rehearse(160, 24, seed))
+        assert all(abs(pose.x) < 2.0 and abs(pose.y) < 1.5 for pose in play.drive.poses)
+
+
 def test_a_fault_needs_a_drive_around_it(rehearsal):
     with pytest.raises(SimulationError, match='begin at frame 8 of a drive of 5'):
         rehearse(320, 5)
@@ -261,13 +279,15 @@ def test_the_command_names_faults_and_refuses_what_it_does_not_know(capsys):
         (['thunder'], "no fault is called 'thunder'"),
         (['none', '--width', '641'], '--width 641'),
         (['none', '--frames', '9'], '--frames 9'),
+        (['none', '--drives', '0'], '--drives 0'),
     ):
         assert main(['faults', *arguments]) == 2
         assert words in capsys.readouterr().err
 
 
 def test_the_command_prints_and_writes_its_table(tmp_path, capsys):
-    code = main(['faults', 'black', '--width', '640', '--frames', '18', '--output', str(tmp_path)])
+    code = main(['faults', 'black', '--width', '640', '--frames', '18', '--drives', '1',
+                 '--output', str(tmp_path)])
     printed = capsys.readouterr().out
     assert (tmp_path / 'faults.md').read_text() == printed
     (row,) = csv.DictReader((tmp_path / 'faults.csv').open())

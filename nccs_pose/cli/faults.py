@@ -22,7 +22,7 @@ from pathlib import Path
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.evaluation.fault_table import fault_csv, fault_table, run_fault
+from nccs_pose.evaluation.fault_table import combine, fault_csv, fault_table, run_fault
 from nccs_pose.files.text_files import write_text
 from nccs_pose.simulation.fault_list import FAULTS
 from nccs_pose.simulation.faults import Fault, rehearse
@@ -36,9 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--width', type=int, default=640, metavar='PX',
         help='width of the images, 4:3 (default: %(default)s)')
     parser.add_argument(
-        '--frames', type=int, default=26, metavar='N',
+        '--frames', type=int, default=24, metavar='N',
         help='images of a clean drive, at 10 Hz; the fault begins at the ninth '
              '(default: %(default)s)')
+    parser.add_argument(
+        '--drives', type=int, default=2, metavar='N',
+        help='on how many tracks each fault is played (default: %(default)s)')
     parser.add_argument(
         '--output', type=Path, metavar='DIR', help='write faults.md and faults.csv there')
 
@@ -53,15 +56,18 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.width < 160 or arguments.width % 4:
         raise OptionError(
             f'--width {arguments.width}: must be a multiple of 4 px, from 160 px')
+    if arguments.drives < 1:
+        raise OptionError(f'--drives {arguments.drives}: must be 1 at least')
     if arguments.frames < 18:
         raise OptionError(
             f'--frames {arguments.frames}: 8 before, 8 of the fault and 2 after it make 18 at '
             'least')
-    rehearsal = rehearse(arguments.width, arguments.frames)
+    rehearsals = [
+        rehearse(arguments.width, arguments.frames, seed) for seed in range(arguments.drives)]
     rows = []
     with Progress(len(faults), 'faults') as progress:
         for fault in faults:
-            rows.append(run_fault(fault, rehearsal, Localiser))
+            rows.append(combine([run_fault(fault, each, Localiser) for each in rehearsals]))
             progress.step(fault.name)
     text = fault_table(rows)
     wrong = sum(row.wrong for row in rows)

@@ -50,7 +50,7 @@ class Answering(Protocol):
 
 @dataclass(frozen=True)
 class FaultRow:
-    """One fault, played once.
+    """One fault, played once, or several times together.
 
     :ivar fault: which.
     :ivar frames: images that arrived.
@@ -152,6 +152,23 @@ def _count(fault: Fault, answers: Sequence[_Answer]) -> FaultRow:
         recovered=after.index(True) + 1 if any(after) else None,
         worst_distance=max((answer.distance for answer in given), default=math.nan),
         worst_angle=max((answer.angle for answer in given), default=math.nan),
+    )
+
+
+def combine(rows: Sequence[FaultRow]) -> FaultRow:
+    """Add up one fault's rows of several drives; recovery and errors are the worst of all."""
+    recoveries = [row.recovered for row in rows]
+    distances = [row.worst_distance for row in rows if row.answered]
+    angles = [row.worst_angle for row in rows if row.answered]
+    return FaultRow(
+        rows[0].fault,
+        frames=sum(row.frames for row in rows),
+        answered=sum(row.answered for row in rows),
+        wrong=sum(row.wrong for row in rows),
+        refused=sum(row.refused for row in rows),
+        recovered=None if None in recoveries else max(recoveries),
+        worst_distance=max(distances, default=math.nan),
+        worst_angle=max(angles, default=math.nan),
     )
 
 

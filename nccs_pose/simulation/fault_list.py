@@ -19,13 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import dataclasses
 import functools
+import math
 
 import cv2
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform
 from nccs_pose.simulation.drive import Drive, make_drive, WheelModel
-from nccs_pose.simulation.faults import Event, Fault, SEED
-from nccs_pose.simulation.motion import figure_of_eight
+from nccs_pose.simulation.faults import Event, Fault, Rehearsal, track
 from nccs_pose.simulation.scene import Obstacle, Scene
 from nccs_pose.simulation.sensors import compress
 import numpy as np
@@ -140,27 +140,38 @@ def _mirror_moved(scene: Scene, _: Pose2) -> Scene:
     return dataclasses.replace(scene, rig=moved)
 
 
-def _carried(drive: Drive, start: int, jump: Callable[[Pose2], Pose2]) -> Drive:
-    """Lift the robot at one frame; its wheels do not notice, and it drives on as before."""
-    lifted, put_down = drive.poses[start], jump(drive.poses[start])
+def _carried(rehearsal: Rehearsal, put_down: Pose2) -> Drive:
+    """Lift the robot where the fault begins; its wheels do not notice, and it drives on."""
+    drive, start = rehearsal.drive, rehearsal.start
+    lifted = drive.poses[start]
     poses = tuple(
         pose if k < start else put_down @ (lifted.inverse() @ pose)
         for k, pose in enumerate(drive.poses))
     return dataclasses.replace(drive, poses=poses)
 
 
-def _carried_away(drive: Drive, start: int) -> Drive:
-    return _carried(drive, start, lambda pose: Pose2(2.0, 0.0, 0.0) @ pose)
+def _carried_away(rehearsal: Rehearsal) -> Drive:
+    """Put the robot down 2 m away, on the side where it stays farthest from the arena's border."""
+
+    def reach(drive: Drive) -> float:
+        return max(max(abs(pose.x) / 2.0, abs(pose.y) / 1.5) for pose in drive.poses)
+
+    pose = rehearsal.drive.poses[rehearsal.start]
+    ways = (Pose2(2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.0)
+            for angle in np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False))
+    return min((_carried(rehearsal, way @ pose) for way in ways), key=reach)
 
 
-def _turned_round(drive: Drive, start: int) -> Drive:
-    return _carried(drive, start, lambda pose: pose @ Pose2(0.0, 0.0, np.pi))
+def _turned_round(rehearsal: Rehearsal) -> Drive:
+    pose = rehearsal.drive.poses[rehearsal.start]
+    return _carried(rehearsal, pose @ Pose2(0.0, 0.0, np.pi))
 
 
-def _faster(drive: Drive, _: int) -> Drive:
+def _faster(rehearsal: Rehearsal) -> Drive:
+    drive, seed = rehearsal.drive, rehearsal.seed
     return make_drive(
-        figure_of_eight(phase=-0.5 * np.pi), 2 * len(drive), 40.0, WheelModel(),
-        np.random.default_rng(SEED), drive.stamps_ns[0])
+        track(seed), 2 * len(drive), 40.0, WheelModel(), np.random.default_rng([seed, 1]),
+        drive.stamps_ns[0])
 
 
 def _dropped(events: Iterator[tuple[bool, Event]]) -> Iterator[Event]:
