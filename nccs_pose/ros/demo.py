@@ -156,7 +156,9 @@ def _demo(options: argparse.Namespace) -> int:
     with SerialisedBag(bag_path) as bag:
         pictures = np.linspace(bag.start_ns, bag.end_ns, PICTURES + 2)[1:-1].astype(int).tolist()
         user = DemoUser(record, options.output, pictures)
-        player = Player(user, bag, Playback(rate=options.rate))
+        played = (topics.image, topics.camera_info, topics.odom)
+        player = Player(user, bag, Playback(
+            rate=options.rate, topics=tuple(topic for topic in played if topic)))
         localiser = _start_localiser(options.params, topics.image, topics.camera_info, topics.odom)
         spinning = threading.Thread(target=_spin, args=(user,), daemon=True)
         spinning.start()

@@ -145,9 +145,11 @@ def image_status(
     if problem:
         words, level = problem, DiagnosticStatus.WARN
     values: dict[str, object] = {
-        'topic': topic, 'publishers': publishers, 'frames_received': tally.received, 'frames_answered': tally.answered,
+        'topic': topic, 'publishers': publishers,
+        'frames_received': tally.received, 'frames_answered': tally.answered,
         'frames_dropped_busy': tally.let_go, 'frames_lost_by_middleware': tally.lost,
-        'clock_resets': tally.resets, 'refused': sum(tally.refused.values()), 'errors': sum(tally.errors.values()),
+        'clock_resets': tally.resets,
+        'refused': sum(tally.refused.values()), 'errors': sum(tally.errors.values()),
         'last_refusal': tally.last_refusal, 'last_error': tally.last_error}
     values.update({f'refused.{cause}': n for cause, n in sorted(tally.refused.items())})
     values.update({f'error.{name}': n for name, n in sorted(tally.errors.items())})

@@ -62,7 +62,8 @@ POSE = Endpoint(
     "base_link in the map frame at the image's stamp, only when it can be trusted.")
 DIAGNOSTICS = Endpoint(
     '/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray',
-    'State, reason, quality, counts and times; every second and whenever the state changes.')
+    'State, reason, quality, counts and times; every diagnostics_period and at every change of '
+    'the state.')
 DEBUG_IMAGE = Endpoint(
     '~/debug_image', 'sensor_msgs/msg/Image',
     'What was detected and what was predicted; drawn only while somebody subscribes.', True, 1)
@@ -92,8 +93,9 @@ STATUSES = (
      '`withheld`), reason, age_s, lines_used, points_used, residual_px, expected_px, explained, '
      'claimed, ambiguity, unobserved, candidates, sigma_x_m, sigma_y_m, sigma_yaw_rad'),
     ('`localiser: images`',
-     'topic, publishers, frames_received, frames_answered, frames_dropped_busy, frames_lost_by_middleware, '
-     'clock_resets, refused and refused.*cause*, errors and error.*function*, last_refusal, last_error'),
+     'topic, publishers, frames_received, frames_answered, frames_dropped_busy, '
+     'frames_lost_by_middleware, clock_resets, refused and refused.*cause*, errors and '
+     'error.*function*, last_refusal, last_error'),
     ('`localiser: time`',
      'decode_ms, predict_ms, detect_ms, associate_ms, measure_ms, refine_ms, total_ms, '
      'arrival_to_answer_ms'),

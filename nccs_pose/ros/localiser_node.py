@@ -64,7 +64,6 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import SetBool, Trigger
 
-DIAGNOSTICS_PERIOD = 1.0
 TRANSFORM_RETRY_PERIOD = 0.02
 
 
@@ -98,7 +97,8 @@ class LocaliserNode(LifecycleNode):
         self.create_service(SetBool, SET_PAUSED.name, self._on_set_paused)
         # Steady time: reports come also before the first /clock and while a bag is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(DIAGNOSTICS_PERIOD, self._on_second, clock=self._steady)
+        self.create_timer(
+            self.get_parameter('diagnostics_period').value, self._on_period, clock=self._steady)
         self._retry_timer = self.create_timer(
             TRANSFORM_RETRY_PERIOD, self._on_retry, clock=self._steady, autostart=False)
 
@@ -320,7 +320,7 @@ class LocaliserNode(LifecycleNode):
         if self._outputs is not None:
             self._outputs.transforms.retry(self.get_clock().now().nanoseconds)
 
-    def _on_second(self) -> None:
+    def _on_period(self) -> None:
         if self._keeper is not None:
             self._keeper.save_if_due()
         self._report_diagnostics()

@@ -78,6 +78,9 @@ class NodeOptions:
         '', doc='Where the last good pose is kept for the next start; empty keeps none.')
     saved_pose_interval: float = option(
         10.0, unit='s', low=0.1, high=3600.0, doc='How often the pose is saved while tracking.')
+    diagnostics_period: float = option(
+        1.0, unit='s', low=0.05, high=10.0,
+        doc='How often /diagnostics is published; a change of state is published at once.')
     silence_warning: float = option(
         5.0, unit='s', low=0.5, high=3600.0, live=True,
         doc='After so long without an image the node says what it waits for.')

@@ -174,7 +174,7 @@ class World:
     def localiser(self, *ros_arguments: str, **parameters: object) -> Process:
         """Start the node under test; a parameter that is None is not given."""
         arguments = ['--ros-args', *ros_arguments]
-        for name, value in parameters.items():
+        for name, value in {'diagnostics_period': 0.1, **parameters}.items():
             if value is None:
                 continue
             text = str(value).lower() if isinstance(value, bool) else value

@@ -23,16 +23,16 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
-from nccs_pose.evaluation.metrics import compare, summarise  # noqa: E402
-from nccs_pose.evaluation.trajectory import Trajectory  # noqa: E402
-from nccs_pose.files.bags import BagReader  # noqa: E402
-from nccs_pose.files.serialised_bag import SerialisedBag  # noqa: E402
-from nccs_pose.ros.conversions import pose_to_planar, stamp_to_ns  # noqa: E402
-import numpy as np  # noqa: E402
-from rclpy.serialization import serialize_message  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from sensor_msgs.msg import CameraInfo  # noqa: E402
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nccs_pose.evaluation.metrics import compare, summarise
+from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.bags import BagReader
+from nccs_pose.files.serialised_bag import SerialisedBag
+from nccs_pose.ros.conversions import pose_to_planar, stamp_to_ns
+import numpy as np
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo
 
 BAG = 'bags/room'
 IMAGE = '/camera/image_raw/compressed'

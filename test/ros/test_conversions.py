@@ -25,18 +25,19 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped  # noqa: E402
-from hypothesis import given, strategies as st  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402
-from nccs_pose.errors import FrameRefusedError  # noqa: E402
-from nccs_pose.geometry.pose import Pose2  # noqa: E402
-from nccs_pose.ros import conversions as c  # noqa: E402
-from nccs_pose.ros.camera_check import contradiction  # noqa: E402
-from nccs_pose.simulation.scene import arena_rig  # noqa: E402
-import numpy as np  # noqa: E402
-from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from hypothesis import given
+from hypothesis import strategies as st
+from nav_msgs.msg import Odometry
+from nccs_pose.errors import FrameRefusedError
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.ros import conversions as c
+from nccs_pose.ros.camera_check import contradiction
+from nccs_pose.simulation.scene import arena_rig
+import numpy as np
+from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
 
 finite = st.floats(-1e3, 1e3, allow_nan=False)
 angles = st.floats(-math.pi + 1e-9, math.pi)
@@ -220,7 +221,8 @@ for message in (
     d.diagnostic_array(c.ns_to_stamp(1), [
         d.pose_status('n', 'active', '', estimate, 0.1), d.pose_status('n', 'active', '', None, 1),
         d.pose_status('n', 'inactive', '', None, 1), d.pose_status('n', 'active', 'x', None, 1),
-        d.image_status('n', '/image', 1, tally, '', 1, 1), d.time_status('n', estimate, 0.1, 0.2)]),
+        d.image_status('n', '/image', 1, tally, '', 1, 1),
+        d.time_status('n', estimate, 0.1, 0.2)]),
 ):
     assert serialize_message(message)
 print('all built')

@@ -25,14 +25,18 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402
-from nccs_pose.geometry.camera import PinholeCamera  # noqa: E402
-from nccs_pose.ros.conversions import (  # noqa: E402
-    camera_info_message, compressed_message, image_message, ns_to_stamp)
-from nccs_pose.simulation.scene import arena_rig  # noqa: E402
-import numpy as np  # noqa: E402
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.ros.conversions import (
+    camera_info_message,
+    compressed_message,
+    image_message,
+    ns_to_stamp,
+)
+from nccs_pose.simulation.scene import arena_rig
+import numpy as np
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
 CAMERA = arena_rig().scaled(0.5).camera

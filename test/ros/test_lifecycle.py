@@ -22,9 +22,9 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from lifecycle_msgs.msg import State, Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
-from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from std_srvs.srv import SetBool, Trigger
 
 ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
 
@@ -106,7 +106,8 @@ def test_signals_end_the_active_node_cleanly(world, how):
 
 
 def test_silence_is_said_with_the_topic(world):
-    node, user = world.localiser('-r', 'image:=/front/image', silence_warning=0.5, **ROOM), world.user
+    node = world.localiser('-r', 'image:=/front/image', silence_warning=0.5, **ROOM)
+    user = world.user
     assert user.wait(lambda: 'nothing publishes /front/image' in getattr(
         user.statuses.get('localiser: images'), 'message', '')), node.output
     assert 'nothing publishes /front/image' in node.output

@@ -20,9 +20,14 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import (  # noqa: E402
-    DescribeParameters, GetParameters, ListParameters, SetParameters, SetParametersAtomically)
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
 
 ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
 

@@ -23,12 +23,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
-from nccs_pose.ros.conversions import decode, image_message, stamp_to_ns  # noqa: E402
-import numpy as np  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nccs_pose.ros.conversions import decode, image_message, stamp_to_ns
+import numpy as np
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+from visualization_msgs.msg import MarkerArray
 
 ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
 

@@ -23,15 +23,15 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
-from geometry_msgs.msg import TransformStamped  # noqa: E402
-from nccs_pose.errors import OptionError  # noqa: E402
-from nccs_pose.geometry.pose import Pose2  # noqa: E402
-from nccs_pose.ros.conversions import ns_to_stamp, yaw_quaternion  # noqa: E402
-from nccs_pose.ros.node_options import NodeOptions  # noqa: E402
-from nccs_pose.ros.transforms import TransformOutput  # noqa: E402
-import numpy as np  # noqa: E402
-from rclpy.time import Time  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+from geometry_msgs.msg import TransformStamped
+from nccs_pose.errors import OptionError
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.ros.conversions import ns_to_stamp, yaw_quaternion
+from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.ros.transforms import TransformOutput
+import numpy as np
+from rclpy.time import Time
+from scipy.spatial.transform import Rotation
 
 STAMP = 1_700_000_000_123_456_789
 
