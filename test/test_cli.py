@@ -127,6 +127,22 @@ def test_replaying_twice_gives_the_same_bytes(drive: Path, tmp_path: Path) -> No
     assert contents[0] == contents[1]
 
 
+def test_the_paper_s_chain_runs_over_the_same_bag_and_is_worse(
+    drive: Path, tmp_path: Path,
+) -> None:
+    rmse = {}
+    for method in ('nccs', 'paper'):
+        output = tmp_path / f'{method}.tum'
+        assert main(['replay', str(drive), *calibrated(drive), '--output', str(output),
+                     '--method', method]) == 0
+        assert json.loads((tmp_path / f'{method}.run.json').read_text())['method'] == method
+        numbers = json.loads((tmp_path / f'{method}.evaluation.json').read_text())
+        assert numbers['answered'] == 5
+        assert ('nees' in numbers) == (method == 'nccs')  # the paper gives no covariance
+        rmse[method] = numbers['translation_m']['rmse']
+    assert 3.0 * rmse['nccs'] < rmse['paper'] < 0.3
+
+
 def test_rendering_twice_gives_the_same_bag(drive: Path, tmp_path: Path) -> None:
     again = tmp_path / 'eight'
     main(['render', str(again), '--frames', '5', '--width', '640', '--scene', 'ideal'])

@@ -61,13 +61,13 @@ COMMANDS = (
             f'nccs-pose check bags/room {_ROOM}'),
     Command('experiment', 'nccs_pose.evaluation.experiments',
             "repeat the paper's experiments",
-            'nccs-pose experiment --help'),
+            'nccs-pose experiment pixel-noise --trials 50 --output out/experiments'),
     Command('benchmark', 'nccs_pose.evaluation.benchmark',
-            'measure what a frame costs, stage by stage',
-            'nccs-pose benchmark'),
+            'measure speed, against the published estimator',
+            'nccs-pose benchmark --output out/benchmark.json'),
     Command('faults', 'nccs_pose.cli.faults',
             'play every named fault through the localiser and count what it makes of it',
-            'nccs-pose faults'),
+            'nccs-pose faults --output out'),
 )
 
 

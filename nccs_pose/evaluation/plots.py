@@ -94,8 +94,9 @@ def error_figure(
                   label='estimated minus true')
         axes.set_ylabel(f'{name} ({unit})')
         axes.grid(color='#e4e4e4', linewidth=0.6)
-    panels[0].legend(loc='upper right', fontsize=9, ncols=2)
-    panels[0].set_title(title)
+    panels[0].legend(
+        loc='lower right', bbox_to_anchor=(1.0, 1.0), fontsize=9, ncols=2, frameon=False)
+    panels[0].set_title(title, loc='left')
     panels[-1].set_xlabel('time (s)')
     return figure
 
