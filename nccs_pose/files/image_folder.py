@@ -1,0 +1,50 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A folder of images as a drive: sorted by name, stamped by their number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+from nccs_pose.errors import FileError
+from nccs_pose.vision.decode import Image
+import numpy as np
+
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff')
+_PERIOD_NS = 100_000_000  # between images that carry no time
+
+
+def image_files(folder: str | Path) -> list[Path]:
+    """The images of a folder, sorted by name; empty if it holds none."""
+    folder = Path(folder)
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+
+
+def read_images(files: list[Path]) -> Iterator[tuple[int, Image]]:
+    """Stamps, in nanoseconds, and BGR images (H, W, 3).
+
+    :raises FileError: naming a file that is no image.
+    """
+    for number, path in enumerate(files):
+        try:
+            data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        except OSError as error:
+            raise FileError(f'{path}: cannot be read: {error.strerror or error}.') from error
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        if image is None:
+            raise FileError(f'{path}: is no readable image.')
+        yield number * _PERIOD_NS, image
