@@ -221,7 +221,8 @@ class LocaliserNode(LifecycleNode):
             self.get_logger().warning(
                 f'the stamps jumped back by {back:.3f} s: the tracker starts anew')
         self._estimate = estimate
-        if self._outputs.publish(estimate, frame_id, image, not self._withheld()):
+        if self._outputs.publish(
+                estimate, frame_id, image, not self._withheld(), self._localiser.options):
             self._tally.answered += 1
             self._pose_stamp_ns = stamp_ns
             self._keeper.remember(estimate)

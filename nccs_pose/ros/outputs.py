@@ -20,10 +20,11 @@ from collections.abc import Callable
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nccs_pose.estimation.estimate import Estimate
-from nccs_pose.evaluation.overlay import draw_overlay
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.ros.conversions import image_message, pose_message
+from nccs_pose.ros.debug_image import draw_debug_image
 from nccs_pose.ros.interface import DEBUG_IMAGE, MARKERS, POSE
 from nccs_pose.ros.markers import marker_array
 from nccs_pose.ros.node_options import NodeOptions
@@ -60,11 +61,13 @@ class Outputs:
 
     def publish(
         self, estimate: Estimate, frame_id: str, image: NDArray[np.uint8], trusted: bool,
+        estimator: LocaliserOptions,
     ) -> bool:
         """Publish an estimate; what nobody subscribes is not computed.
 
         :param frame_id: of the image.
         :param trusted: false withholds pose and transform.
+        :param estimator: the options it was made with.
         :returns: whether a pose was published.
         """
         given = trusted and estimate.pose is not None and estimate.covariance is not None
@@ -73,7 +76,7 @@ class Outputs:
                 estimate.stamp_ns, self._frame, estimate.pose, estimate.covariance))
             self.transforms.broadcast(estimate.stamp_ns, estimate.pose)
         if self._debug.get_subscription_count():
-            drawn = draw_overlay(image, self._rig, self._map, estimate)
+            drawn = draw_debug_image(image, self._rig, self._map, estimate, estimator)
             self._debug.publish(image_message(estimate.stamp_ns, frame_id, drawn))
         if self._markers.get_subscription_count():
             self._markers.publish(marker_array(self._frame, estimate, self._rig, self._map))
