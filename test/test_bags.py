@@ -203,7 +203,7 @@ def test_flipped_bytes_never_end_in_a_traceback(tmp_path: Path) -> None:
     data = (path / 'bag.mcap').read_bytes()
     rng = np.random.default_rng(5)
     refused = 0
-    for _ in range(60):
+    for _ in range(30):
         damaged = bytearray(data)
         for at in rng.integers(0, len(data), 8):
             damaged[at] = rng.integers(0, 256)
@@ -215,7 +215,7 @@ def test_flipped_bytes_never_end_in_a_traceback(tmp_path: Path) -> None:
                         event.decode()
         except (FileError, VisionError):
             refused += 1
-    assert refused > 10
+    assert refused > 5
 
 
 def rewrite_metadata(path: Path, change: Callable[[str], str]) -> None:

@@ -33,6 +33,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagWriter
 from nccs_pose.files.trajectories import read_tum, write_tum
+from nccs_pose.files.yaml_files import load_map, load_rig, save_rig
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 import pytest
@@ -156,12 +157,17 @@ def test_rendering_twice_gives_the_same_bag(drive: Path, tmp_path: Path) -> None
 
 
 def test_render_takes_another_rig_and_map(tmp_path: Path) -> None:
-    bag = tmp_path / 'bag'
-    assert main(['render', str(bag), '--frames', '1', '--compression', 'none', *ROOM]) == 0
+    bag, rig = tmp_path / 'bag', tmp_path / 'small.yaml'
+    save_rig(load_rig(ROOM[1]).scaled(1 / 3), rig)
+    assert main(['render', str(bag), '--frames', '1', '--compression', 'none',
+                 '--rig', str(rig), '--map', ROOM[3]]) == 0
     with BagReader(bag) as reader:
         assert reader.topics.image == '/camera/image_raw'
-        assert reader.camera().width == 960
-        assert next(reader.events(odometry=False)).decode().shape == (720, 960, 3)
+        assert reader.camera().width == 320
+        assert next(reader.events(odometry=False)).decode().shape == (240, 320, 3)
+    written = load_map(tmp_path / 'bag_map.yaml')
+    np.testing.assert_array_equal(written.starts, load_map(ROOM[3]).starts)
+    assert load_rig(tmp_path / 'bag_rig.yaml').camera == load_rig(rig).camera
 
 
 def black_bag(path: Path, size: tuple[int, int] = (720, 960)) -> Path:
