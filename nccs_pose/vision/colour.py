@@ -36,6 +36,8 @@ CONTRASTS: dict[str, tuple[float, float, float]] = {
 }
 # A learned contrast further than this from its class is no longer that colour.
 _DRIFT_COSINE = 0.5
+# A contrast is learned when its mean is this many times its standard error.
+_EVIDENT = 4.0
 # Blur that an image can have, px, and how far one image may change it.
 _BLUR_RANGE = (0.35, 3.0)
 _BLUR_STEP = 0.3
@@ -87,6 +89,10 @@ class LineColour:
         :param used: 1 where a sample counts (N, K).
         """
         along = height @ self.discriminant
+        mean = float(power @ along) / float(power.sum())
+        # Those of mere noise that happen to be positive would pass for a faint tape.
+        if mean < _EVIDENT * float(np.linalg.norm(power * (along - mean))) / float(power.sum()):
+            return self
         good = along > 0.3 * max(float(np.median(along)), 0.0)
         if good.sum() < 10:
             return self
