@@ -295,6 +295,7 @@ def test_trajectories_without_common_time_end_with_1(tmp_path: Path, capsys: Cap
 
 
 def test_help_is_complete_and_explains_every_command(capsys: Capture) -> None:
+    pytest.importorskip('joblib')  # for experiment alone
     code, out, _ = said(capsys, ['--help'])
     assert code == 0
     for command in COMMANDS:
@@ -319,6 +320,15 @@ def test_help_loads_neither_numpy_nor_opencv() -> None:
     run = subprocess.run(
         [sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == '[]'
+
+
+def test_a_missing_package_is_named() -> None:
+    code = ('import sys; sys.modules["rosbags"] = None; from nccs_pose.cli import main; '
+            'sys.exit(main(["replay", "--help"]))')
+    run = subprocess.run([sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True)
+    assert run.returncode == 2
+    assert 'pip install "rosbags' in run.stderr
+    assert 'Traceback' not in run.stderr
 
 
 def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
