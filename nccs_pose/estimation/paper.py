@@ -252,14 +252,15 @@ def _solve(
 
     # in units of the start's own violation, as the objective
     unit = max(problem.g2(first)[0], 1e-30) if use_g2 else math.inf
-    best = [math.inf, first]
+    best, best_merit = first, math.inf
 
     def objective(parameters: Array) -> tuple[float, Array]:
+        nonlocal best, best_merit
         gamma, slope = problem.gamma_r(parameters)
         value = float(np.abs(gamma).mean()) / scale
         merit = value + abs(_g1(parameters)) + problem.g2(parameters)[0] / unit
-        if merit < best[0]:
-            best[:] = merit, parameters.copy()
+        if merit < best_merit:
+            best, best_merit = parameters.copy(), merit
         return value, np.sign(gamma) @ slope / (len(gamma) * scale)
 
     constraints = [{
@@ -273,7 +274,7 @@ def _solve(
         objective, first, jac=True, method='SLSQP', constraints=constraints,
         options={'maxiter': max_iterations, 'ftol': 1e-12})
     # Where the constraints cannot be met SLSQP may give back its start: take the best it saw.
-    found = result.x if result.success else best[1]
+    found: Array = result.x if result.success else best
     if not np.isfinite(found).all() or math.hypot(found[0], found[1]) < 1e-12:
         found = first
     c, s, t_x, t_y = found

@@ -142,7 +142,7 @@ def _work(rig: Rig, data: DataSet) -> dict[str, Callable[[], Any]]:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(_BULK, 3))
     y, z = rng.uniform(-0.02, 0.02, (2, _BULK))
-    line = Line([-2.0, 1.0, 0.0], [2.0, 1.2, 0.0])
+    line = Line(np.array([-2.0, 1.0, 0.0]), np.array([2.0, 1.2, 0.0]))
     curve = ReflectionCurve.of_line(rig, line)
 
     def full() -> None:

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from mpl_toolkits.mplot3d import Axes3D
 from nccs_pose.evaluation.experiment_summary import Results
 from nccs_pose.evaluation.line_projection import ProjectedScenes
 from nccs_pose.evaluation.trials import Answer, Cell
@@ -108,12 +109,12 @@ def projection_figure(scenes: list[ProjectedScenes]) -> Figure:
     figure.legend(handles, labels, loc='outside lower center', ncols=5, markerscale=2.0)
     figure.suptitle(
         'Top: lines in the mirror frame (m), the camera looks at the mirror from +z. Middle: '
-        'their curves on the mirror by γ and x,\nand points of the same lines projected independently '
-        '(circles), mm. Bottom: where γ = 0 for the first line, in the image (px).', fontsize=11)
+        'their curves on the mirror by γ and x,\nand points of the same lines projected '
+        'independently (circles), mm. Bottom: where γ = 0 for the first line, in the image (px).', fontsize=11)
     return figure
 
 
-def _draw_lines(axes: Axes, scene: ProjectedScenes) -> None:
+def _draw_lines(axes: Axes3D, scene: ProjectedScenes) -> None:
     for colour, line in zip(_LINE_COLOURS * 9, scene.drawn):
         axes.plot(*line.points.T, color=colour, linewidth=1.4)
         axes.plot(*line.points.T, '*', color=colour, markersize=6, linestyle='none')
@@ -122,7 +123,7 @@ def _draw_lines(axes: Axes, scene: ProjectedScenes) -> None:
     axes.set(xlabel='x', ylabel='y', zlabel='z')
 
 
-def _draw_mirror(axes: Axes, scene: ProjectedScenes) -> None:
+def _draw_mirror(axes: Axes3D, scene: ProjectedScenes) -> None:
     mirror = scene.rig.mirror
     reach = 1.1 * float(np.quantile(np.concatenate(
         [np.hypot(line.mirror_points[:, 0], line.mirror_points[:, 1]) for line in scene.drawn]),

@@ -126,6 +126,8 @@ def run_experiment(
         if value < 1:
             raise OptionError(f'{key} = {value}: must be at least 1')
     output.mkdir(parents=True, exist_ok=True)
+    header: tuple[str, ...] = _HEADER
+    rows: list[tuple[object, ...]]
     if name == LINE_PROJECTION:
         scenes = [project_lines(options, mirror, trials) for mirror in TABLE_ONE]
         rows, figure = [row for s in scenes for row in s.rows], projection_figure(scenes)
@@ -136,7 +138,6 @@ def run_experiment(
         rows = [
             row for cell, answers in results for i, trial in enumerate(answers)
             for row in _rows(name, options, cell, i, trial)]
-        header = _HEADER
         figure = box_figure(EXPERIMENTS[name].title, EXPERIMENTS[name].axis, results)
         summary = summary_text(name, EXPERIMENTS[name].title, trials, options, results)
     (output / f'{name}.csv').write_text(_csv(header, rows), encoding='utf-8')

@@ -157,11 +157,13 @@ def run_trial(options: ExperimentOptions, cell: Cell, trial: int) -> tuple[Answe
 def our_estimate(rig: Rig, data: DataSet, cell: Cell) -> Pose2 | None:
     """Closed form without a start, then the robust refinement in pixels."""
     rays = rig.back_project(data.pixels)
-    noise = {'sigma': cell.sigma_px or _NO_NOISE_PX, 'sigma_world': cell.sigma_world}
+    sigma, world = cell.sigma_px or _NO_NOISE_PX, cell.sigma_world
     try:
-        first = solve(rays, data.directions, data.moments, data.label, **noise)[0].pose
+        found = solve(
+            rays, data.directions, data.moments, data.label, sigma=sigma, sigma_world=world)
         return refine(
-            rays, data.directions[data.label], data.moments[data.label], first, **noise).pose
+            rays, data.directions[data.label], data.moments[data.label], found[0].pose,
+            sigma=sigma, sigma_world=world).pose
     except EstimationError:
         return None
 
@@ -183,7 +185,8 @@ def make_data_set(
 
     :raises SimulationError: if the rig hardly sees any line of this range.
     """
-    truth = Pose2(*rng.uniform(-_REACH, _REACH, 2), rng.uniform(-math.pi, math.pi))
+    x, y = rng.uniform(-_REACH, _REACH, 2).tolist()
+    truth = Pose2(x, y, rng.uniform(-math.pi, math.pi))
     # a uniform direction and distance, so that the start is anywhere in the disc
     angle, distance = rng.uniform(-math.pi, math.pi), math.sqrt(rng.uniform())
     reach, turn = (3.0, 180.0) if cell.blind else (options.start_distance, options.start_angle)

@@ -21,6 +21,7 @@ from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
 import numpy as np
+from numpy.typing import NDArray
 
 _FIRST_SAMPLES = 65
 _MOST_ROUNDS = 14
@@ -76,5 +77,5 @@ def _first_samples(rig: Rig, line: Line) -> Array:
     return np.clip(from_foot + away * np.tan(angle), 0.0, line.length)
 
 
-def _project(rig: Rig, line: Line, along: Array) -> tuple[Array, Array]:
+def _project(rig: Rig, line: Line, along: Array) -> tuple[Array, NDArray[np.bool_]]:
     return rig.project(line.start + along[:, None] * line.direction)

@@ -66,7 +66,8 @@ class Bivariate:
 
     def __call__(self, y: ArrayLike, z: ArrayLike) -> Array:
         """Value at y and z, of one shape."""
-        return np.polynomial.polynomial.polyval2d(y, z, self.coefficients)
+        in_z = np.polynomial.polynomial.polyval(np.asarray(y, dtype=float), self.coefficients)
+        return np.polynomial.polynomial.polyval(np.asarray(z, dtype=float), in_z, tensor=False)
 
     def monomials(self, relative: float = 1e-12) -> list[tuple[int, int]]:
         """Powers (i, j) whose coefficient exceeds ``relative`` times the largest one."""

@@ -27,18 +27,20 @@ The plain resultant is D^2 G.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
 
-Polynomial = list[Array]
+Polynomial = Sequence[Array | float]
 """Coefficients by rising power of z, each an array (N,) or a number common to all points."""
 
 
 def _times(*factors: Polynomial) -> Polynomial:
-    product: Polynomial = [np.float64(1.0)]
+    product: list[Array | float] = [1.0]
     for factor in factors:
-        terms: Polynomial = [np.float64(0.0)] * (len(product) + len(factor) - 1)
+        terms: list[Array | float] = [0.0] * (len(product) + len(factor) - 1)
         for i, a in enumerate(product):
             for j, b in enumerate(factor):
                 terms[i + j] = terms[i + j] + a * b
@@ -47,7 +49,7 @@ def _times(*factors: Polynomial) -> Polynomial:
 
 
 def _plus(*summands: Polynomial) -> Polynomial:
-    total: Polynomial = [np.float64(0.0)] * max(map(len, summands))
+    total: list[Array | float] = [0.0] * max(map(len, summands))
     for summand in summands:
         for i, a in enumerate(summand):
             total[i] = total[i] + a
