@@ -110,7 +110,8 @@ def projection_figure(scenes: list[ProjectedScenes]) -> Figure:
     figure.suptitle(
         'Top: lines in the mirror frame (m), the camera looks at the mirror from +z. Middle: '
         'their curves on the mirror by γ and x,\nand points of the same lines projected '
-        'independently (circles), mm. Bottom: where γ = 0 for the first line, in the image (px).', fontsize=11)
+        'independently (circles), mm. Bottom: where γ = 0 for the first line, in the image (px).',
+        fontsize=11)
     return figure
 
 
