@@ -70,12 +70,11 @@ def test_bag_is_localised_over_dds(world, repository):
 
 def test_player_keeps_bytes_order_and_timing(world, repository):
     user = world.user
-    infos = user.listen(CameraInfo, '/camera/camera_info')
     truths = user.listen(PoseStamped, '/ground_truth/pose')
-    arrivals: list[float] = []
+    infos: list[tuple[float, CameraInfo]] = []
     clocks = user.listen(Clock, '/clock')
     user.node.create_subscription(
-        CameraInfo, '/camera/camera_info', lambda m: arrivals.append(time.monotonic()), 100)
+        CameraInfo, '/camera/camera_info', lambda m: infos.append((time.monotonic(), m)), 100)
     player = world.start(
         'player', BAG, '--rate', '4', '--start-offset', '20.2', '--clock', '--topics',
         '/camera/camera_info', '/ground_truth/pose', '--wait-for', '/camera/camera_info',
@@ -87,10 +86,10 @@ def test_player_keeps_bytes_order_and_timing(world, repository):
             (received, data) for topic, received, data in bag.messages(
                 ['/camera/camera_info'], bag.start_ns + 20_200_000_000)]
         begin, end = bag.start_ns + 20_200_000_000, bag.end_ns
-    assert [serialize_message(m) for m in infos] == [data for _, data in recorded]
+    assert [serialize_message(m) for _, m in infos] == [data for _, data in recorded]
     assert len(truths) > 200
     # Four times as fast: compared by the longest stretch, which a loaded machine hardly changes.
-    played = arrivals[-1] - arrivals[0]
+    played = infos[-1][0] - infos[0][0]
     assert played == pytest.approx(1e-9 * (recorded[-1][0] - recorded[0][0]) / 4.0, abs=0.4)
     stamps = [stamp_to_ns(c.clock) for c in clocks]
     assert stamps == sorted(stamps)
