@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.point_polynomial import real_roots, reflection_polynomial
-from nccs_pose.geometry.projection import reflect_points
+from nccs_pose.geometry.projection import _Scene, reflect_points
 from nccs_pose.simulation.table_one import TABLE_ONE
 import numpy as np
 import pytest
@@ -265,3 +265,31 @@ def test_no_points_is_no_problem() -> None:
     m, visible = reflect_points(mirror, cop, np.zeros((0, 3)))
     assert m.shape == (0, 3)
     assert visible.shape == (0,)
+
+
+@pytest.mark.parametrize('name', SCENES)
+def test_the_polynomial_alone_finds_the_same(name: str) -> None:
+    """The way that a point takes when Newton's steps end without a certificate."""
+    mirror, cop = SCENES[name]
+    points = space_points(1000, seed=9)
+    m, visible = reflect_points(mirror, cop, points)
+    scene = _Scene(mirror, cop)
+    x, y, found = scene._by_polynomial((points[visible] - scene.apex) / scene.unit)
+    assert found.all()
+    again = np.stack([x, y], axis=1) * scene.unit
+    assert np.linalg.norm(again - m[visible, :2], axis=1).max() < 1e-9
+
+
+@pytest.mark.parametrize('name', TABLE_ONE)
+def test_extreme_points_give_finite_answers(name: str) -> None:
+    mirror, cop = SCENES[name]
+    apex = np.array([0.0, 0.0, mirror.apex_z])
+    near = apex + np.array([0.0, 0.0, 1e-9])
+    seen = np.array([cop, near, [1e9, 1e9, 1e9], [1e-300, 0.0, 1.0], [1e100, 0.0, 0.0]])
+    m, visible = reflect_points(mirror, cop, seen)
+    assert visible.all()
+    assert np.abs(mirror.level(m)).max() < 1e-15
+    # at the apex itself and below it there is nothing to see
+    m, visible = reflect_points(mirror, cop, np.stack([apex, apex - np.array([0.0, 0.0, 1e-3])]))
+    assert not visible.any()
+    assert not m.any()
