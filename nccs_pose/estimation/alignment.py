@@ -169,6 +169,7 @@ class Aligner:
             return refine(
                 rays[hit], self._map.directions[label[hit]], self._map.moments[label[hit]],
                 start, sigma=sigma[hit], prior=prior, noise_known=False,
+                calibration_sigma=self._options.calibration_sigma,
                 attitude_sigma=(self._options.height_sigma, self._options.tilt_sigma)), hit
         except EstimationError:
             return None

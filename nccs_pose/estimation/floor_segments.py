@@ -22,6 +22,7 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
@@ -31,6 +32,8 @@ from numpy.typing import NDArray
 
 # A line needs so many pixels and so much length, metres.
 _LEAST_PIXELS = 10
+# Of a large blob only some pixels are looked at; a few of them in a row are no line yet.
+_LEAST_SAMPLES = 8
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
@@ -75,8 +78,20 @@ class _Points:
 
     def tolerance(self, normal: Array, width: float) -> Array:
         """How far from a tape's midline its pixels may be (..., P), for normals (..., 2)."""
-        footprint = np.linalg.norm(np.einsum('pij,...i->...pj', self.jacobian, normal), axis=-1)
+        # |J^T n|^2 = n^T (J J^T) n: one matrix product for all normals and points.
+        square = np.stack(
+            [normal[..., 0] ** 2, 2.0 * normal[..., 0] * normal[..., 1], normal[..., 1] ** 2],
+            axis=-1)
+        footprint = np.sqrt(np.maximum(square @ self.spread, 0.0))
         return 0.5 * width + 0.75 * footprint + 0.005
+
+    @cached_property
+    def spread(self) -> Array:
+        """The three elements of the symmetric J J^T (3, P)."""
+        by_u, by_v = self.jacobian[:, :, 0], self.jacobian[:, :, 1]
+        return np.stack([
+            by_u[:, 0] ** 2 + by_v[:, 0] ** 2, by_u[:, 0] * by_u[:, 1] + by_v[:, 0] * by_v[:, 1],
+            by_u[:, 1] ** 2 + by_v[:, 1] ** 2])
 
 
 def floor_segments(
@@ -175,7 +190,7 @@ def _strip(
         across = np.abs(points.floor @ normal - offset)
         tolerance = points.tolerance(normal, width)
         inside = _longest_run(points, normal, free & (across < tolerance))
-        if points.weight[inside].sum() < _LEAST_PIXELS:
+        if inside.sum() < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
     along = points.floor @ np.array([-normal[1], normal[0]])
     low, high = along[inside].min(), along[inside].max()

@@ -68,6 +68,10 @@ class LocaliserOptions:
         0.0, unit='rad', low=0.0, high=0.1, live=True,
         doc='How flat the floor is: roll and pitch are estimated in every frame within that. '
             '0 holds them.')
+    calibration_sigma: float = option(
+        0.0, unit='px', low=0.0, high=10.0, live=True,
+        doc='What the calibration may shift the whole image by; it widens the covariance, since '
+            'no number of pixels averages it out.')
     innovation_gate: float = option(
         6.0, low=2.0, high=50.0, live=True,
         doc='Largest disagreement of the image with the predicted pose, in standard deviations, '

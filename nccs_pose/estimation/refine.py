@@ -91,6 +91,7 @@ def refine(
     sigma_world: float = 0.0,
     prior: tuple[Pose2, Array] | None = None,
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
+    calibration_sigma: float = 0.0,
     robust: bool = True,
     noise_known: bool = True,
     max_iterations: int = 30,
@@ -108,6 +109,8 @@ def refine(
     :param prior: a pose with its covariance (3, 3), weighed in like a measurement.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held, the rest is estimated beside the pose.
+    :param calibration_sigma: what the calibration may shift the whole image by, px; no number of
+        pixels averages it out, so it widens the covariance.
     :param robust: False takes every pixel for an inlier.
     :param noise_known: False takes ``sigma`` for relative and its scale from the residuals.
     :raises EstimationError: with fewer than three rays, or a ray that missed the mirror.
@@ -136,7 +139,12 @@ def refine(
     degrees = max(1, int(inlier.sum()) - 3)
     inflation = float(e[inlier] @ e[inlier]) / degrees
     inflation = max(1.0, inflation) if noise_known else max(1e-6, inflation)
-    covariance = np.linalg.inv(normal / inflation + known + _vague(len(known)))[:3, :3]
+    covariance = np.linalg.inv(normal / inflation + known + _vague(len(known)))
+    if calibration_sigma > 0.0:
+        shift = form.image_shift(unknowns)[inlier]
+        answer = covariance @ (jacobian[inlier].T @ shift) * (calibration_sigma / inflation)
+        covariance = covariance + answer @ answer.T
+    covariance = covariance[:3, :3]
     attitude = unknowns[3:] if len(unknowns) == 6 else np.zeros(3)
     return Refinement(
         Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],

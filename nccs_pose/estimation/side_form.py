@@ -89,6 +89,12 @@ class SideForm:
             [s[:, 1:] - (numerator / variance)[:, None] * half_slope, by_attitude], axis=1)
         return numerator * scale, scale[:, None] * jacobian
 
+    def image_shift(self, unknowns: Array) -> Array:
+        """de/d(u, v) (N, 2): what a shift of the whole image does to the residuals."""
+        gradient = (self._rows[1:3] @ monomials(Pose2(*unknowns[:3]))).T
+        variance = self._variance * np.square(gradient).sum(axis=1)
+        return gradient / np.sqrt(np.maximum(variance, 1e-30))[:, None]
+
     def of(self, chosen: Array) -> SideForm:
         """The same for some of the pixels."""
         part = object.__new__(SideForm)

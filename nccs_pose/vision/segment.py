@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From an image to blobs that can be lines: colour threshold, morphology, connected regions."""
+"""From an image to blobs that can be lines: colour threshold, morphology, contours."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     'magenta': ((140, 60, 40), (170, 255, 255)),
     'cyan': ((80, 60, 40), (100, 255, 255)),
 }
-# Smaller blobs are noise, px.
-_SMALLEST = 6
-# More blobs than this are clutter; the largest are kept.
+# Blobs with a shorter outline are noise, px.
+_SMALLEST = 8
+# More blobs than this are clutter; the longest are kept (a byte numbers them).
 _MOST = 150
 
 
@@ -70,12 +70,7 @@ def chromatic_mask(
     :param least: smallest contrast that counts, as a fraction of the image's brightness.
     :param window: width of the surroundings, px.
     """
-    weights = np.array(CONTRASTS[colour])
-    if abs(weights.sum()) > 1e-9:
-        weights, offset = weights / 3.0, 0.0 if weights.sum() > 0.0 else 255.0
-    else:
-        offset = 128.0
-    feature = cv2.transform(image, np.append(weights, offset)[None].astype(np.float32))
+    feature = _contrast(image, colour)
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
     around = cv2.blur(feature, (window, window))
     sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
@@ -84,6 +79,28 @@ def chromatic_mask(
     threshold = max(2.0, gate * noise, least * brightness)
     return cv2.threshold(
         cv2.subtract(feature, around), threshold, 255.0, cv2.THRESH_BINARY)[1]
+
+
+def _contrast(image: NDArray[np.uint8], colour: str) -> Mask:
+    """The colour's contrast in each pixel, 128 (or the brightness, for white) where there is none.
+
+    The mean of the channels that rise less that of those that fall, in whole grey levels.
+    """
+    channels = cv2.split(image)
+    rising, falling = ([channel for channel, sign in zip(channels, CONTRASTS[colour])
+                        if sign * way > 0.0] for way in (1.0, -1.0))
+    if not falling:
+        return _mean(rising)
+    if not rising:
+        return cv2.bitwise_not(_mean(falling))
+    return cv2.addWeighted(_mean(rising), 1.0, _mean(falling), -1.0, 128.0)
+
+
+def _mean(channels: list[Mask]) -> Mask:
+    mean = channels[0]
+    for count, channel in enumerate(channels[1:], start=2):
+        mean = cv2.addWeighted(mean, 1.0 - 1.0 / count, channel, 1.0 / count, 0.0)
+    return mean
 
 
 def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
@@ -99,28 +116,27 @@ def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
 
 
 def find_blobs(mask: Mask, pixels_per_blob: int) -> Segmentation:
-    """Close small gaps and collect the connected regions of a mask.
+    """Close small gaps and collect what lies within the contours of a mask.
 
     Tapes may be a pixel wide, so nothing is ever eroded.
 
     :param mask: (H, W) uint8, 255 inside.
     """
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    area = stats[1:, cv2.CC_STAT_AREA]
-    order = np.argsort(-area, kind='stable')[:_MOST]
-    kept = order[area[order] >= _SMALLEST] + 1
-    number = np.full(count, -1, dtype=np.intp)
-    number[kept] = np.arange(len(kept))
-    points = cv2.findNonZero(closed)
-    points = np.zeros((0, 2), np.intp) if points is None else points.reshape(-1, 2)
-    blob = number[labels[points[:, 1], points[:, 0]]]
-    points, blob = points[blob >= 0], blob[blob >= 0]
+    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    kept = sorted((c for c in contours if len(c) >= _SMALLEST), key=len, reverse=True)[:_MOST]
+    # Filling the few contours that matter is far cheaper than labelling every pixel.
+    filled = np.zeros_like(closed)
+    for number, contour in enumerate(kept, start=1):
+        cv2.drawContours(filled, [contour], -1, number, cv2.FILLED)
+    found = cv2.findNonZero(cv2.bitwise_and(filled, closed))
+    points = np.zeros((0, 2), np.intp) if found is None else found.reshape(-1, 2)
+    blob = filled[points[:, 1], points[:, 0]].astype(np.intp) - 1
     order = np.argsort(blob, kind='stable')
     points, blob = points[order], blob[order]
     size = np.bincount(blob, minlength=len(kept))
     stride = np.maximum(1, size // pixels_per_blob)
-    first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.intp)
+    first = np.cumsum(size) - size
     chosen = (np.arange(len(blob)) - first[blob]) % stride[blob] == 0
     return Segmentation(
         closed, points[chosen].astype(float), blob[chosen], stride[blob[chosen]].astype(float))
