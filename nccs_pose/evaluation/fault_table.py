@@ -157,7 +157,7 @@ def _count(fault: Fault, answers: Sequence[_Answer]) -> FaultRow:
 
 def combine(rows: Sequence[FaultRow]) -> FaultRow:
     """Add up one fault's rows of several drives; recovery and errors are the worst of all."""
-    recoveries = [row.recovered for row in rows]
+    recoveries = [row.recovered for row in rows if row.recovered is not None]
     distances = [row.worst_distance for row in rows if row.answered]
     angles = [row.worst_angle for row in rows if row.answered]
     return FaultRow(
@@ -166,7 +166,7 @@ def combine(rows: Sequence[FaultRow]) -> FaultRow:
         answered=sum(row.answered for row in rows),
         wrong=sum(row.wrong for row in rows),
         refused=sum(row.refused for row in rows),
-        recovered=None if None in recoveries else max(recoveries),
+        recovered=max(recoveries) if len(recoveries) == len(rows) else None,
         worst_distance=max(distances, default=math.nan),
         worst_angle=max(angles, default=math.nan),
     )

@@ -30,7 +30,7 @@ import numpy as np
 
 # Offsets in a cell of the middles of its parts, (2, parts).
 _FINE_SIDE = 8
-_FINE = (np.stack(np.mgrid[:_FINE_SIDE, :_FINE_SIDE]).reshape(2, -1) + 0.5) / _FINE_SIDE - 0.5
+_FINE = (np.indices((_FINE_SIDE, _FINE_SIDE)).reshape(2, -1) + 0.5) / _FINE_SIDE - 0.5
 
 
 def half_plane_area(value: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:

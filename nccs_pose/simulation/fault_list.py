@@ -24,7 +24,7 @@ import math
 import cv2
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform
-from nccs_pose.simulation.drive import Drive, make_drive, WheelModel
+from nccs_pose.simulation.drive import Drive, ImageSample, make_drive, WheelModel
 from nccs_pose.simulation.faults import Event, Fault, Rehearsal, track
 from nccs_pose.simulation.scene import Obstacle, Scene
 from nccs_pose.simulation.sensors import compress
@@ -55,9 +55,9 @@ def _sensor(**gains: float) -> Callable[[Scene, Pose2], Scene]:
 
     def change(scene: Scene, _: Pose2) -> Scene:
         sensor = scene.sensor
-        balance = tuple(
-            gain * gains.get(name, 1.0)
-            for name, gain in zip(('blue', 'green', 'red'), sensor.white_balance))
+        blue, green, red = sensor.white_balance
+        balance = (blue * gains.get('blue', 1.0), green * gains.get('green', 1.0),
+                   red * gains.get('red', 1.0))
         sensor = dataclasses.replace(
             sensor, exposure=sensor.exposure * gains.get('exposure', 1.0), white_balance=balance)
         return dataclasses.replace(scene, sensor=sensor)
@@ -182,11 +182,12 @@ def _frozen(events: Iterator[tuple[bool, Event]]) -> Iterator[Event]:
     """Repeat the last good picture under new stamps."""
     last = None
     for _, event in events:
-        if event.faulty and last is not None:
-            sample = dataclasses.replace(event.sample, image=last)
-            event = dataclasses.replace(event, sample=sample)
-        elif event.is_image:
-            last = event.sample.image
+        sample = event.sample
+        if isinstance(sample, ImageSample):
+            if event.faulty and last is not None:
+                event = dataclasses.replace(event, sample=dataclasses.replace(sample, image=last))
+            else:
+                last = sample.image
         yield event
 
 

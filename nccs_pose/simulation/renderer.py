@@ -58,9 +58,8 @@ def expected_image(scene: Scene, pose: Pose2, twist: Twist | None = None) -> np.
 
 
 def _irradiance(scene: Scene, pose: Pose2, twist: Twist | None) -> np.ndarray:
-    sensor = scene.sensor
-    steps = sensor.exposure_steps if twist is not None and sensor.exposure_time > 0.0 else 1
-    if steps == 1:
+    sensor, steps = scene.sensor, scene.sensor.exposure_steps
+    if twist is None or sensor.exposure_time == 0.0 or steps == 1:
         return irradiate(paint(scene, pose), sensor)
     moments = ((np.arange(steps) + 0.5) / steps - 0.5) * sensor.exposure_time
     total = paint(scene, integrate_twist(pose, twist, float(moments[0])))
@@ -112,7 +111,8 @@ def _paint_floor(
 ) -> None:
     if look.texture is not None:
         level = floor_level(look.texture, view.footprint)
-        light = light * floor_brightness(look.texture, *_floor_on_map(view, pose), level)
+        x, y = _floor_on_map(view, pose)
+        light = light * floor_brightness(look.texture, x, y, level)
     floor = colours[: len(view.floor)]
     np.multiply(light[:, None], np.array(look.floor_colour, np.float32), out=floor)
 

@@ -138,18 +138,22 @@ def _add_noise(irradiance: np.ndarray, sensor: SensorModel, rng: np.random.Gener
 def compress(image: np.ndarray, quality: int) -> np.ndarray:
     """Give the (H, W, 3) uint8 image after JPEG of the quality (1 to 100) and back."""
     _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
 
 
 def _quantise(irradiance: np.ndarray, gamma: float) -> np.ndarray:
     flat = irradiance.reshape(irradiance.shape[0], -1)
     if gamma == 1.0:
-        grey = cv2.multiply(flat, 255.0, dtype=cv2.CV_8U)
+        grey = _saturated(flat, 255.0, cv2.CV_8U)
     else:
         # The table's steps are far below one grey level but in the darkest few.
-        steps = cv2.multiply(flat, 65535.0, dtype=cv2.CV_16U)
-        grey = _response_table(gamma)[steps]
+        grey = _response_table(gamma)[_saturated(flat, 65535.0, cv2.CV_16U)]
     return grey.reshape(irradiance.shape)
+
+
+def _saturated(values: np.ndarray, scale: float, kind: int) -> np.ndarray:
+    """Scale, round to the nearest and keep within the kind of integer."""
+    return np.asarray(cv2.addWeighted(values, scale, values, 0.0, 0.0, dtype=kind))
 
 
 @functools.lru_cache(maxsize=4)

@@ -158,8 +158,8 @@ def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     rows = -(-count // columns)
     if not rows:
         return np.empty((0, *image.shape[2:]), np.float32)
-    maps = np.zeros((2, rows * columns), np.float32)
-    maps[0, :count], maps[1, :count] = u, v
-    maps = maps.reshape(2, rows, columns)
+    flat = np.zeros((2, rows * columns), np.float32)
+    flat[0, :count], flat[1, :count] = u, v
+    maps = flat.reshape(2, rows, columns)
     out = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return out.reshape(rows * columns, *image.shape[2:])[:count]
