@@ -24,6 +24,7 @@ import argparse
 from collections.abc import Sequence
 import contextlib
 from dataclasses import dataclass, field
+import os
 from pathlib import Path
 import struct
 import subprocess
@@ -135,6 +136,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', default='out', type=Path, help='folder for the pictures')
     options = parser.parse_args(argv)
     use_large_images()
+    # By itself, unless the user says where: another robot's images would be localised as well.
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 99))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    _say(f'on ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, where you can watch')
     try:
         rclpy.init(args=[])
         return _demo(options)

@@ -118,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     use_large_images()
     # Alone on its domain: another robot's images would be counted too.
-    os.environ.setdefault('ROS_DOMAIN_ID', '96')
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 99))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; '
           f'rendering {DISTINCT_FRAMES} frames', flush=True)
