@@ -1,0 +1,215 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Whether the covariance is true, scenario by scenario, on rendered images with their truth.
+
+Every trial is a fresh image of a random pose, searched from nothing, so that errors are
+independent and the bands of chi-square hold. Where the lines in view do not fix a pose, the trial
+is two images: one that does, and then, an odometry step later, the one in question; the wheels err
+as the localiser expects them to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from dataclasses import dataclass
+import math
+
+from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.motion import by_odometry
+from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
+from nccs_pose.evaluation.tables import table
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import arena_scene, ideal_scene, Obstacle, Scene
+import numpy as np
+
+_SPREAD = (0.9, 0.6)
+_FRAME_NS = 100_000_000
+# The step of the robot between two images, m, m and rad.
+_MOTION = (0.05, 0.0, 0.03)
+_PEOPLE = 3
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One row of the table.
+
+    :ivar name: in the table and on the command line.
+    :ivar scene: what is there.
+    :ivar seen: names of the lines that the second image shows; None for all, in a single image.
+    :ivar people: how many stand about at random, close to the robot.
+    """
+
+    name: str
+    scene: Callable[[], Scene]
+    seen: tuple[str, ...] | None = None
+    people: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Covered:
+    """What became of a scenario.
+
+    :ivar trials: how many there were.
+    :ivar error: x, y (m) and yaw (rad) of those with a pose (N, 3).
+    :ivar covariance: of each (N, 3, 3).
+    """
+
+    scenario: Scenario
+    trials: int
+    error: Array
+    covariance: Array
+
+    @property
+    def consistency(self) -> Consistency:
+        """NEES and coverage."""
+        return consistency(self.error, self.covariance)
+
+    @property
+    def verdict(self) -> str:
+        """In a word: the NEES against its 95 % band."""
+        found = self.consistency
+        if found.count == 0:
+            return 'no pose'
+        if found.mean_nees > found.band[1]:
+            return 'too sure'
+        return 'too careful' if found.mean_nees < found.band[0] else 'true'
+
+
+def _ideal(width: int, noise: float, **sensor: float) -> Callable[[], Scene]:
+    def scene() -> Scene:
+        made = ideal_scene(width, noise)
+        return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))
+
+    return scene
+
+
+def _arena(width: int, **sensor: float) -> Callable[[], Scene]:
+    def scene() -> Scene:
+        made = arena_scene(width)
+        return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))
+
+    return scene
+
+
+def _parallel() -> Scene:
+    """The ideal arena, its northern tape turned until it is parallel to the southern one."""
+    scene = ideal_scene(640, 0.02)
+    south, east, north, west = scene.line_map
+    half, middle = 0.5 * north.length * south.direction, 0.5 * (north.start + north.end)
+    turned = dataclasses.replace(north, start=middle + half, end=middle - half)
+    return dataclasses.replace(scene, line_map=LineMap((south, east, turned, west)))
+
+
+SCENARIOS = (
+    Scenario('ideal 1280, 1 % noise', _ideal(1280, 0.01)),
+    Scenario('ideal 1280, 5 % noise', _ideal(1280, 0.05)),
+    Scenario('ideal 640, 1 % noise', _ideal(640, 0.01)),
+    Scenario('ideal 640, 2 % noise', _ideal(640, 0.02)),
+    Scenario('ideal 640, 5 % noise', _ideal(640, 0.05)),
+    Scenario('ideal 640, 10 % noise', _ideal(640, 0.10)),
+    Scenario('blur of 1 px', _ideal(640, 0.02, psf_sigma=1.0)),
+    Scenario('blur of 2 px', _ideal(640, 0.02, psf_sigma=2.0)),
+    Scenario('JPEG 90', _ideal(640, 0.02, jpeg_quality=90)),
+    Scenario('JPEG 50', _ideal(640, 0.02, jpeg_quality=50)),
+    Scenario('JPEG 20', _ideal(640, 0.02, jpeg_quality=20)),
+    Scenario('people in the way', _ideal(640, 0.02), people=_PEOPLE),
+    Scenario('textured arena 1280', _arena(1280)),
+    Scenario('textured arena 640', _arena(640)),
+    Scenario('textured arena 640, JPEG 30', _arena(640, jpeg_quality=30)),
+    Scenario('textured arena 640, people', _arena(640), people=_PEOPLE),
+    Scenario('one line', _ideal(640, 0.02), seen=('south',)),
+    Scenario('two parallel lines', _parallel, seen=('south', 'north')),
+)
+
+
+def run_scenario(
+    scenario: Scenario, trials: int, *, seed: int = 3,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Covered:
+    """Play a scenario's trials to one localiser that forgets everything between them."""
+    scene = scenario.scene()
+    localiser = Localiser(scene.rig, scene.line_map)
+    errors, covariances = [], []
+    for k in range(trials):
+        rng = np.random.default_rng([seed, k])
+        pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (*_SPREAD, np.pi))
+        localiser.reset()
+        if scenario.seen is None:
+            peopled = _peopled(scene, scenario.people, pose, rng)
+            estimate = localiser.process(0, render(peopled, pose, rng))
+        else:
+            pose, estimate = _second_image(localiser, scene, scenario.seen, pose, rng)
+        progress(scenario.name)
+        if estimate.pose is None or estimate.covariance is None:
+            continue
+        error = estimate.pose.as_array() - pose.as_array()
+        error[2] = wrap_angle(error[2])
+        errors.append(error)
+        covariances.append(estimate.covariance)
+    return Covered(
+        scenario, trials, np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)))
+
+
+def _peopled(scene: Scene, count: int, pose: Pose2, rng: np.random.Generator) -> Scene:
+    people = []
+    for _ in range(count):
+        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.6, 1.2)
+        people.append(Obstacle(
+            pose.x + distance * math.cos(angle), pose.y + distance * math.sin(angle), 0.2, 1.7))
+    look = scene.appearance
+    look = dataclasses.replace(look, obstacles=(*look.obstacles, *people))
+    return dataclasses.replace(scene, appearance=look)
+
+
+def _second_image(
+    localiser: Localiser, scene: Scene, seen: tuple[str, ...], pose: Pose2,
+    rng: np.random.Generator,
+) -> tuple[Pose2, Estimate]:
+    """The true pose and the estimate of an image that follows one with all lines."""
+    step = Pose2(*_MOTION)
+    # An error of the wheels as likely as the localiser takes it for.
+    expected = by_odometry(pose, np.zeros((3, 3)), Pose2(0.0, 0.0, 0.0), step)
+    measured = Pose2.from_array(rng.multivariate_normal(
+        (pose @ step).as_array(), expected.covariance))
+    localiser.add_odometry(-_FRAME_NS, pose)
+    localiser.add_odometry(0, pose)
+    localiser.process(0, render(scene, pose, rng))
+    localiser.add_odometry(_FRAME_NS, measured)
+    kept = LineMap(tuple(line for line in scene.line_map if line.name in seen))
+    image = render(dataclasses.replace(scene, line_map=kept), pose @ step, rng)
+    return pose @ step, localiser.process(_FRAME_NS, image)
+
+
+def coverage_table(rows: list[Covered]) -> str:
+    """All scenarios as Markdown; coverage is that of x, y and yaw, each by its own sigma."""
+    one, two, three = expected_coverage()
+    cells = [['scenario', 'answered', 'NEES (3)', '95 % band', f'1 sigma ({one:.3f})',
+              f'2 sigma ({two:.3f})', f'3 sigma ({three:.3f})', 'RMS mm', 'RMS mdeg',
+              'covariance']]
+    for row in rows:
+        found = row.consistency
+        translation = Statistic.of(np.hypot(row.error[:, 0], row.error[:, 1])).rmse
+        yaw = Statistic.of(np.abs(row.error[:, 2])).rmse
+        cells.append([
+            row.scenario.name, f'{found.count} of {row.trials}', f'{found.mean_nees:.2f}',
+            f'{found.band[0]:.2f} to {found.band[1]:.2f}',
+            *(f'{value:.3f}' for value in found.pooled),
+            f'{1e3 * translation:.3f}', f'{1e3 * math.degrees(yaw):.2f}', row.verdict])
+    return table(cells)

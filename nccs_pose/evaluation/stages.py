@@ -1,0 +1,196 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What a frame costs, stage by stage, against one full-frame HSV threshold of the same image.
+
+Frames of a drive through the arena are tracked, then searched as if the robot were lost; before
+and after each, the same image is thresholded (cvtColor and inRange). Times are the thread's own
+processor time with OpenCV held to one thread, so that what else the machine does meanwhile is not
+counted; every ratio is of neighbours in time, and its quartiles are part of the result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+import time
+from typing import Any
+
+import cv2
+from nccs_pose.errors import OptionError
+from nccs_pose.estimation.estimate import StageTimes
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.evaluation.tables import table
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.simulation.motion import figure_of_eight
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import arena_scene
+import numpy as np
+from numpy.typing import NDArray
+
+TRACKING = 'tracking'
+SEARCHING = 'searching'
+STAGES = tuple(field.name for field in fields(StageTimes))
+_RATE = 10.0
+_GREEN = ((40, 50, 40), (90, 255, 255))
+
+
+@dataclass(frozen=True, eq=False)
+class StageCosts:
+    """Seconds of every frame, and of the threshold pass beside it.
+
+    :ivar width: of the images, px.
+    :ivar threshold: of the pass beside each frame, by mode (N,).
+    :ivar total: of the frame, by mode (N,); the whole call.
+    :ivar stages: of each frame's stages, in the shares that the localiser tells, by mode, in the
+        order of STAGES (N, 5).
+    :ivar answered: how many frames got a pose, by mode.
+    :ivar start_up: from a loaded calibration to the first pose, seconds by the clock.
+    """
+
+    width: int
+    threshold: dict[str, Array]
+    total: dict[str, Array]
+    stages: dict[str, Array]
+    answered: dict[str, int]
+    start_up: float
+
+    def ratio(self, mode: str) -> Array:
+        """Cost of each frame over that of the threshold pass (N,)."""
+        return self.total[mode] / self.threshold[mode]
+
+
+def threshold_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """One full-frame HSV threshold: the unit of cost."""
+    return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), *_GREEN)
+
+
+def measure_stages(
+    width: int, frames: int, *, seed: int = 4,
+    progress: Callable[[str], None] = lambda text: None,
+) -> StageCosts:
+    """Time tracking and searching on the same drive.
+
+    :param width: of the images, px; 4:3.
+    :param frames: of the drive; the first is the start-up and is not counted as tracking.
+    :raises OptionError: for fewer than 4 frames.
+    """
+    if frames < 4:
+        raise OptionError(f'frames = {frames}: quartiles need at least 4')
+    scene, track = arena_scene(width), figure_of_eight()
+    rng = np.random.default_rng(seed)
+    poses = [track.pose(k / _RATE) for k in range(frames)]
+    images = []
+    for pose in poses:
+        images.append(render(scene, pose, rng))
+        progress('rendered')
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        start = time.perf_counter()
+        localiser = Localiser(scene.rig, scene.line_map)
+        localiser.process(0, images[0])
+        start_up = time.perf_counter() - start
+        modes = {mode: _run(localiser, poses, images, mode, progress)
+                 for mode in (TRACKING, SEARCHING)}
+    finally:
+        cv2.setNumThreads(threads)
+    return StageCosts(
+        width,
+        {mode: np.array([frame.threshold for frame in run]) for mode, run in modes.items()},
+        {mode: np.array([frame.total for frame in run]) for mode, run in modes.items()},
+        {mode: np.array([frame.stages for frame in run]) for mode, run in modes.items()},
+        {mode: sum(frame.answered for frame in run) for mode, run in modes.items()}, start_up)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    threshold: float
+    total: float
+    stages: list[float]
+    answered: bool
+
+
+def _run(
+    localiser: Localiser, poses: list[Pose2], images: list[NDArray[np.uint8]], mode: str,
+    progress: Callable[[str], None],
+) -> list[_Frame]:
+    """Give all images but the first, which only starts tracking, and time them."""
+    localiser.reset()
+    # Wheels without error: the cost is what counts here.
+    localiser.add_odometry(_stamp(-1), poses[0])
+    localiser.add_odometry(_stamp(0), poses[0])
+    localiser.process(0, images[0])
+    run = []
+    for k in range(1, len(images)):
+        localiser.add_odometry(_stamp(k), poses[k])
+        if mode == SEARCHING:
+            localiser.relocalise()
+        run.append(_timed(localiser, k, images[k]))
+        progress(mode)
+    return run
+
+
+def _stamp(k: int) -> int:
+    return round(k / _RATE * 1e9)
+
+
+def _timed(localiser: Localiser, k: int, image: NDArray[np.uint8]) -> _Frame:
+    """One frame, and the threshold pass as the mean of one before and one after it."""
+    times = [time.thread_time()]
+    threshold_pass(image)
+    times.append(time.thread_time())
+    estimate = localiser.process(_stamp(k), image)
+    times.append(time.thread_time())
+    threshold_pass(image)
+    times.append(time.thread_time())
+    before, frame, after = np.diff(times).tolist()
+    # The localiser's stages are by the clock: what they share in is the processor's time.
+    share = frame / max(estimate.times.total, 1e-9)
+    return _Frame(
+        0.5 * (before + after), frame,
+        [share * getattr(estimate.times, stage) for stage in STAGES], estimate.pose is not None)
+
+
+def stages_table(costs: StageCosts) -> str:
+    """The costs as Markdown: ratios to the threshold pass, median and quartiles."""
+    rows = [['', *(f'{mode}: ratio (quartiles)' for mode in costs.total),
+             *(f'{mode}: ms' for mode in costs.total)]]
+    rows.append(_row('whole frame', costs, costs.total))
+    for number, stage in enumerate(STAGES):
+        rows.append(_row(stage, costs, {m: v[:, number] for m, v in costs.stages.items()}))
+    rows.append(_row('cvtColor + inRange', costs, costs.threshold))
+    answers = ', '.join(
+        f'{costs.answered[mode]} of {len(costs.total[mode])} {mode}' for mode in costs.total)
+    return (f'{costs.width} x {costs.width * 3 // 4} px; answered {answers}; calibration to '
+            f'first pose {costs.start_up:.2f} s.\n\n{table(rows)}')
+
+
+def _row(name: str, costs: StageCosts, seconds: dict[str, Array]) -> list[str]:
+    ratios, milliseconds = [], []
+    for mode, values in seconds.items():
+        low, middle, high = np.percentile(values / costs.threshold[mode], [25, 50, 75])
+        ratios.append(f'{middle:.2f} ({low:.2f} to {high:.2f})')
+        milliseconds.append(f'{1e3 * float(np.median(values)):.2f}')
+    return [name, *ratios, *milliseconds]
+
+
+def as_numbers(costs: StageCosts) -> dict[str, Any]:
+    """Every single time for JSON, seconds."""
+    return {
+        'width': costs.width, 'start_up': costs.start_up, 'answered': costs.answered,
+        'modes': {mode: {
+            'frame': costs.total[mode].tolist(), 'threshold': costs.threshold[mode].tolist(),
+            'stages': dict(zip(STAGES, costs.stages[mode].T.tolist()))} for mode in costs.total}}
