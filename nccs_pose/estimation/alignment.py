@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.options import LocaliserOptions
@@ -38,7 +38,14 @@ _ITERATIONS = 8
 # A measured shift is right to a fifth or better: the poses have settled when the last step was
 # below one standard deviation of what was measured.
 _SETTLED = 1.0
+# What still steps at the end, by less than this (m and rad), is uncertain by that much more.
+_LAST_STEP = 0.005
 _LEAST_STATIONS = 12
+# A line of so many stations, so wide in the image (px), of which less than this fraction is
+# found, is missing.
+_PLAIN_STATIONS = 15
+_PLAIN_WIDTH = 1.0
+_MISSING = 0.25
 # Neighbours that may share one cause of error (a shade, a tile, a block of JPEG).
 _BLOCK = 12
 
@@ -53,6 +60,8 @@ class Alignment:
     :ivar points: the pixels it rests on, labelled by map line.
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
+    :ivar missing: map lines that should be seen plainly and are not there.
+    :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
     """
 
@@ -62,6 +71,8 @@ class Alignment:
     points: LinePoints
     explained: float
     lines: tuple[int, ...]
+    missing: tuple[int, ...]
+    misfit: float
     colours: tuple[LineColour, ...]
 
 
@@ -109,11 +120,16 @@ class Aligner:
             result = self._solve(bands, fit, pose, prior, colours)
             if result is None:
                 return None
+            step = result.pose.as_array() - pose.as_array()
+            step[2] = wrap_angle(step[2])
             settled = close(result.pose, pose, result.covariance, _SETTLED)
             pose = result.pose
             if settled:
                 return result
-        return None
+        if result is None or np.abs(step).max() > _LAST_STEP:
+            return None
+        # Stations that come and go near their thresholds can keep it stepping to and fro.
+        return replace(result, covariance=result.covariance + np.outer(step, step))
 
     def _bands(self, pose: Pose2) -> Bands:
         return predict_bands(self._table, self._map, pose, self._options.stations)
@@ -193,30 +209,53 @@ class Aligner:
         scale = float(np.sqrt(np.mean(refinement.residual[refinement.inlier] ** 2)))
         points = LinePoints(
             pixels[hit][refinement.inlier], scale * fit.sigma[index], bands.label[index])
-        correlation = _correlation(refinement.residual[refinement.inlier], points.label)
+        residual = refinement.residual[refinement.inlier]
+        correlation, misfit = _common_errors(residual, points.sigma / scale, points.label)
         return Alignment(
             refinement.pose, correlation * refinement.covariance, refinement, points,
             float(worth[index].sum() / worth.sum()),
-            tuple(int(k) for k in np.unique(points.label)), colours)
+            tuple(int(k) for k in np.unique(points.label)), _missing(bands, index), misfit,
+            colours)
 
 
-def _correlation(residual: Array, label: NDArray[np.intp]) -> float:
-    """How much more the residuals of neighbours add up than independent ones would.
+def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
+    """Lines that should be seen plainly, of which next to nothing is among the found stations."""
+    missing = []
+    for k in np.unique(bands.label):
+        own = bands.label == k
+        plain = own.sum() >= _PLAIN_STATIONS and np.median(
+            2.0 * bands.half_width[own]) >= _PLAIN_WIDTH
+        if plain and own[found].sum() < _MISSING * own.sum():
+            missing.append(int(k))
+    return tuple(missing)
 
-    The variance of sums over blocks of neighbours against that of single residuals: 1 for white
-    noise, up to the block's size where whole stretches err together.
+
+def _common_errors(
+    residual: Array, sigma: Array, label: NDArray[np.intp],
+) -> tuple[float, float]:
+    """What the residuals of neighbours have in common.
+
+    :param residual: whitened residuals (N,), along each line in order.
+    :param sigma: their scale (N,), px.
+    :param label: line (N,).
+    :returns: the variance of sums over blocks of neighbours against that of independent ones (1
+        for white noise, up to the block's size where whole stretches err together), and the root
+        mean square of the blocks' means beyond noise, px.
     """
-    sums, sizes = [], []
-    for k in np.unique(label):
-        own = residual[label == k]
-        for first in range(0, len(own) - _BLOCK + 1, _BLOCK):
-            sums.append(own[first:first + _BLOCK].sum())
-            sizes.append(_BLOCK)
-    if len(sums) < 6:
-        return 1.0
+    blocks = [own[first:first + _BLOCK] for own in
+              (np.flatnonzero(label == k) for k in np.unique(label))
+              for first in range(0, len(own) - _BLOCK + 1, _BLOCK)]
+    if not blocks:
+        return 1.0, 0.0
+    e = residual[np.array(blocks)]
+    off = (e * sigma[np.array(blocks)]).mean(axis=1)
+    noise = np.mean(np.square(sigma * residual)) / _BLOCK
+    misfit = float(np.sqrt(max(0.0, np.mean(np.square(off)) - noise)))
+    if len(blocks) < 6:
+        return 1.0, misfit
     # The fit has taken three degrees of freedom out of the blocks.
-    per_residual = np.square(sums).sum() / np.sum(sizes) * len(sums) / (len(sums) - 3)
-    return float(max(1.0, per_residual / max(np.mean(residual**2), 1e-12)))
+    per_residual = np.mean(np.square(e.sum(axis=1))) / _BLOCK * len(blocks) / (len(blocks) - 3)
+    return float(max(1.0, per_residual / max(np.mean(residual**2), 1e-12))), misfit
 
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:

@@ -40,8 +40,12 @@ _CROSSING = 0.12
 _ANGLE_GATE = 0.07
 # Strips may reach this much beyond a map line's ends, metres.
 _BEYOND = 0.2
+# Of a strip that starts a hypothesis this part may have nothing to do with its line.
+_JOINED = 0.2
 # Samples on each strip and on each map line.
 _SAMPLES = 12
+# Tapes whose ends are this close look the same, metres.
+_SAME_TAPE = 0.05
 # Poses this close are the same, metres and rad.
 _SAME_PLACE = 0.25
 _SAME_YAW = 0.15
@@ -99,6 +103,35 @@ def score_pose(
     return float(scorer.score(pose.as_array()[None])[0])
 
 
+def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
+    """Every motion S of the map that lays its tapes on tapes of the same length and colour.
+
+    From S @ T_map_base the map looks as it does from T_map_base. The identity comes first; a map
+    without symmetry has nothing else.
+    """
+    ends = np.stack([line_map.starts[:, :2], line_map.ends[:, :2]], axis=1)
+    colours = np.array([line.colour for line in line_map])
+    alike = colours[:, None] == colours
+    alike &= np.abs(line_map.lengths[:, None] - line_map.lengths) < _SAME_TAPE
+    # Every such motion turns about the tapes' common centre of gravity.
+    centre = line_map.lengths @ ends.mean(axis=1) / line_map.lengths.sum()
+    heading = np.arctan2(line_map.directions[:, 1], line_map.directions[:, 0])
+    # The tape that may lie on the fewest others leaves the fewest turns to try.
+    first = int(alike.sum(axis=1).argmin())
+    turns = (heading[alike[first]] - heading[first])[:, None] + [0.0, np.pi]
+    found = [Pose2(0.0, 0.0, 0.0)]
+    for turn in np.sort(turns.ravel() % (2.0 * np.pi)):
+        motion = Pose2(*centre, float(turn)) @ Pose2(*-centre, 0.0)
+        moved = motion.apply(ends.reshape(-1, 2)).reshape(ends.shape)
+        off = np.minimum(
+            *(np.linalg.norm(moved[:, None] - there, axis=3).max(axis=2)
+              for there in (ends, ends[:, ::-1])))
+        lands = (alike & (off < _SAME_TAPE)).any(axis=1).all()
+        if lands and all(abs(wrap_angle(motion.yaw - other.yaw)) > _SAME_YAW for other in found):
+            found.append(motion)
+    return tuple(found)
+
+
 def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array:
     """Poses (H, 3) that lay a pair of strips on a pair of map lines."""
     map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
@@ -138,10 +171,13 @@ def _intersect(
     t = np.linalg.solve(matrix, right[..., None])[..., 0]
     fits = np.ones(len(yaw), dtype=bool)
     for strip, line in ((first, a), (second, b)):
-        for end in (strip.start, strip.end):
-            along = np.einsum(
-                'ki,ki->k', lines.direction[line], rotation @ end + t - lines.start[line])
-            fits &= (along > -_BEYOND) & (along < lines.length[line] + _BEYOND)
+        along = np.sort([np.einsum(
+            'ki,ki->k', lines.direction[line], rotation @ end + t - lines.start[line])
+            for end in (strip.start, strip.end)], axis=0)
+        outside = (np.maximum(-along[0], 0.0)
+                   + np.maximum(along[1] - lines.length[line], 0.0))
+        # Something in line with a tape may have been joined to it.
+        fits &= outside < _BEYOND + _JOINED * np.linalg.norm(strip.end - strip.start)
     return np.column_stack([t, yaw])[fits]
 
 
@@ -155,7 +191,8 @@ class _Scorer:
         self._table = table
         # A strip of one colour lies on no line of another.
         self._foreign = np.array([
-            np.repeat([s.colour != colour for s in segments], _SAMPLES) for colour in lines.colour])
+            np.repeat([s.colour != colour for s in segments], _SAMPLES)
+            for colour in lines.colour])
         share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         starts = np.array([s.start for s in segments])
         ends = np.array([s.end for s in segments])

@@ -39,6 +39,8 @@ _LEAST_LENGTH = 0.2
 _LONGEST_GAP = 0.8
 # Something this close beside a strip, metres, makes it part of a larger thing.
 _BESIDE = 0.15
+# So much beside a strip, of what lies in it, is no crossing tape any more.
+_MOST_BESIDE = 0.35
 # Lines drawn through random pairs of pixels of a blob that is no single line.
 _PAIRS = 16
 
@@ -123,9 +125,12 @@ def floor_segments(
         if found is None:
             continue
         normal, offset, inside, beside = found
-        if beside < 0.5:
+        if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
             segments.append(_segment(
                 points, segmentation.pixels, inside, normal, offset, colour))
+        else:
+            # What is left of a solid must not pass for a thinner thing.
+            free &= ~beside
         free &= ~inside
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
@@ -177,10 +182,10 @@ def _fit(floor: Array, weight: Array) -> tuple[Array, float]:
 def _strip(
     points: _Points, free: NDArray[np.bool_], inside: NDArray[np.bool_], normal: Array,
     width: float,
-) -> tuple[Array, float, NDArray[np.bool_], float] | None:
+) -> tuple[Array, float, NDArray[np.bool_], NDArray[np.bool_]] | None:
     """Refine a strip on its own pixels.
 
-    :returns: normal, offset, its pixels (P,), and how much lies beside it over what lies in it;
+    :returns: normal, offset, its pixels (P,) and those of its blobs that lie just beside it (P,);
         None where too little is left.
     """
     offset = 0.0
@@ -200,8 +205,7 @@ def _strip(
     own = np.isin(points.blob, np.unique(points.blob[inside]))
     beside = (own & (across > tolerance) & (across < tolerance + _BESIDE)
               & (along > low) & (along < high))
-    return normal, offset, inside, float(
-        points.weight[beside].sum() / points.weight[inside].sum())
+    return normal, offset, inside, beside
 
 
 def _longest_run(

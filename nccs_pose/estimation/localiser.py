@@ -34,6 +34,7 @@ from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Pred
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.verdict import contradiction, objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -127,6 +128,8 @@ class Localiser:
         self._ever_tracked = False
         self._frames_since_check = 0
         self._colours = self._aligner.nominal_colours
+        # A pose that an image showed against the prediction, and the odometry then.
+        self._rumour: tuple[Pose2, Pose2 | None] | None = None
 
     def set_prior(self, pose: Pose2, covariance: Array) -> None:
         """Give a hypothesis, as by hand or from the last run: it decides between equal poses.
@@ -216,18 +219,20 @@ class Localiser:
             alignment = self._aligner.align(
                 image, prediction.pose, self._colours, reach=reach, prior=prior)
             watch.lap('measure')
-            if alignment is not None and self._acceptable(alignment) and close(
-                    alignment.pose, prediction.pose,
-                    prediction.covariance + alignment.covariance, self.options.innovation_gate):
+            if alignment is not None and self._expected(alignment, prediction) and not objection(
+                    alignment, self.options, expected=True):
                 break
         else:
             return None
         self._frames_since_check += 1
-        if self._frames_since_check < self.options.check_every and len(alignment.lines) > 1:
+        due = self._frames_since_check >= self.options.check_every
+        if not (due or alignment.missing or len(alignment.lines) == 1):
             return _Found(alignment, float('nan'), alignment.explained)
         self._frames_since_check = 0
         segments = self._searcher.segments(image)
         watch.lap('detect')
+        if contradiction(alignment, segments, self._map):
+            return None
         here = self._searcher.score(alignment.pose, segments)
         elsewhere = self._searcher.candidates(segments)
         watch.lap('associate')
@@ -236,8 +241,11 @@ class Localiser:
             return None
         return _Found(alignment, here, alignment.explained)
 
-    def _acceptable(self, alignment: Alignment) -> bool:
-        return alignment.explained >= self.options.least_explained
+    def _expected(self, alignment: Alignment, prediction: Prediction | None) -> bool:
+        """Whether a pose is where the prediction says, within the gate."""
+        return prediction is not None and close(
+            alignment.pose, prediction.pose, prediction.covariance + alignment.covariance,
+            self.options.innovation_gate)
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
@@ -247,13 +255,19 @@ class Localiser:
         watch.lap('detect')
         candidates = self._searcher.candidates(segments)
         watch.lap('associate')
-        found = self._try_all(image, candidates, segments, watch)
-        found.sort(key=lambda f: -f.score)
+        found, objections = self._try_all(image, candidates, segments, prediction, watch)
         if not found:
-            return self._without_pose(stamp_ns, prediction, segments, watch)
+            return self._without_pose(
+                stamp_ns, prediction, _what_is_missing(segments, objections), watch)
         ambiguity = found[1].score / found[0].score if len(found) > 1 else 0.0
         poses = tuple(Candidate(f.alignment.pose, f.score) for f in found)
         if ambiguity <= self.options.ambiguity_ratio:
+            if not self._confirmed(stamp_ns, found[0], prediction):
+                # Neither place is to be believed now: the odometry carries nothing on either.
+                return Estimate(
+                    stamp_ns, State.LOST,
+                    'the image shows another place than expected; the next one has to agree',
+                    candidates=poses, times=watch.times)
             return self._tracking(
                 stamp_ns, found[0], poses, ambiguity, watch, 'found by searching the whole image')
         chosen = self._decide(found, prediction)
@@ -273,17 +287,27 @@ class Localiser:
 
     def _try_all(
         self, image: NDArray[np.uint8], candidates: tuple[Candidate, ...],
-        segments: tuple[FloorSegment, ...], watch: _Stopwatch,
-    ) -> list[_Found]:
-        """Lay the best candidates on the image itself and keep what holds there."""
+        segments: tuple[FloorSegment, ...], prediction: Prediction | None, watch: _Stopwatch,
+    ) -> tuple[list[_Found], list[str]]:
+        """Lay the best candidates on the image itself.
+
+        :returns: what holds there, best first, and why the others do not.
+        """
         found: list[_Found] = []
+        objections: list[str] = []
         for candidate in candidates[:_TRIED]:
             if candidate.score < _WORTH_TRYING * candidates[0].score:
                 break
             alignment = self._aligner.align(
                 image, candidate.pose, self._aligner.nominal_colours, reach=_SEARCH_BAND)
             watch.lap('measure')
-            if alignment is None or not self._acceptable(alignment):
+            if alignment is None:
+                continue
+            words = objection(
+                alignment, self.options, expected=self._expected(alignment, prediction))
+            words = words or contradiction(alignment, segments, self._map)
+            if words:
+                objections.append(words)
                 continue
             if unobserved_directions(
                     alignment.refinement.information, alignment.pose, limit=_OPEN):
@@ -292,7 +316,24 @@ class Localiser:
                 continue
             score = self._searcher.score(alignment.pose, segments)
             found.append(_Found(alignment, score, np.sqrt(score * alignment.explained)))
-        return found
+        return sorted(found, key=lambda f: -f.score), objections
+
+    def _confirmed(self, stamp_ns: int, found: _Found, prediction: Prediction | None) -> bool:
+        """Whether a pose is expected, or two images in a row agree on it against the prediction.
+
+        Who has been carried away is still there in the next image; a mistake seldom is.
+        """
+        pose = found.alignment.pose
+        now = self._odometry.at(stamp_ns)
+        before, self._rumour = self._rumour, (pose, now)
+        if prediction is None or self._expected(found.alignment, prediction):
+            return True
+        if before is None:
+            return False
+        there, odometry = before
+        if odometry is not None and now is not None:
+            there = there @ (odometry.inverse() @ now)
+        return same_pose(there, pose)
 
     def _decide(self, found: list[_Found], prediction: Prediction | None) -> _Found | None:
         """The one pose that a prior or the prediction expects, if it is one."""
@@ -316,6 +357,7 @@ class Localiser:
             stamp_ns, alignment.pose, alignment.covariance, self._odometry.at(stamp_ns))
         self._colours = alignment.colours
         self._prior = None
+        self._rumour = None
         self._ever_tracked = True
         sigma = alignment.points.sigma
         unobserved = unobserved_directions(refinement.information, alignment.pose, limit=_OPEN)
@@ -334,12 +376,9 @@ class Localiser:
             watch.times)
 
     def _without_pose(
-        self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
-        watch: _Stopwatch,
+        self, stamp_ns: int, prediction: Prediction | None, missing: str, watch: _Stopwatch,
     ) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
-        missing = _what_is_missing(segments)
-        quality = Quality(claimed=0.0 if segments else float('nan'))
         track = self._track
         if track is not None and prediction is not None and prediction.by_odometry:
             age = (stamp_ns - track.stamp_ns) * 1e-9
@@ -348,13 +387,15 @@ class Localiser:
                 return Estimate(
                     stamp_ns, State.COASTING,
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
-                    prediction.covariance, quality=quality, times=watch.times)
+                    prediction.covariance, times=watch.times)
         state = State.LOST if self._ever_tracked else State.SEARCHING
-        return Estimate(stamp_ns, state, missing, quality=quality, times=watch.times)
+        return Estimate(stamp_ns, state, missing, times=watch.times)
 
 
-def _what_is_missing(segments: tuple[FloorSegment, ...]) -> str:
+def _what_is_missing(segments: tuple[FloorSegment, ...], objections: list[str]) -> str:
     """Why an image gives no pose, in words."""
+    if objections:
+        return objections[0]
     if not segments:
         return 'no line-like strip in the image'
     if len(segments) == 1:

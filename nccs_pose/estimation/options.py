@@ -57,6 +57,10 @@ class LocaliserOptions:
     least_explained: float = option(
         0.5, low=0.05, high=1.0, live=True,
         doc='Smallest fraction of the predicted line pixels that must be found to track.')
+    largest_misfit: float = option(
+        0.5, unit='px', low=0.05, high=20.0, live=True,
+        doc='Largest root mean square by which whole stretches of lines may lie off before the '
+            'pose is withheld: a rig or a map that does not fit.')
     ambiguity_ratio: float = option(
         0.85, low=0.1, high=1.0, live=True,
         doc='A second pose that scores more than this fraction of the best makes it ambiguous.')

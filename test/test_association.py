@@ -1,0 +1,370 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From strips on the floor to poses, and from blobs to strips."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import itertools
+
+from nccs_pose.estimation.association import (
+    global_candidates,
+    map_symmetries,
+    same_pose,
+    score_pose,
+)
+from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
+from nccs_pose.files.yaml_files import load_map
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import Line, LineMap
+from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import arena_rig, ideal_scene, Obstacle
+from nccs_pose.vision.segment import chromatic_mask, find_blobs
+import numpy as np
+import pytest
+
+REACH = 5.0
+RIG = arena_rig().scaled(0.5)
+WIDTH = 0.05
+
+
+@pytest.fixture(scope='module')
+def table() -> FloorTable:
+    return FloorTable(RIG, REACH)
+
+
+def _line(start: tuple[float, float], end: tuple[float, float], colour: str = 'green') -> Line:
+    return Line(np.array([*start, 0.0]), np.array([*end, 0.0]), width=WIDTH, colour=colour)
+
+
+def _rectangle(length: float, width: float) -> LineMap:
+    x, y = 0.5 * length, 0.5 * width
+    corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
+    return LineMap(tuple(_line(a, b) for a, b in zip(corners, corners[1:] + corners[:1])))
+
+
+def _strips(
+    line_map: LineMap, pose: Pose2, rng: np.random.Generator, noise: float = 0.005,
+) -> tuple[FloorSegment, ...]:
+    """What an exact eye would lay on the floor of the map's lines, within reach (base_link)."""
+    strips = []
+    for line in line_map:
+        share = np.linspace(0.0, 1.0, 200)
+        points = pose.inverse().apply(
+            line.start[:2] + share[:, None] * (line.end - line.start)[:2])
+        pixels, visible = RIG.project(np.column_stack([points, np.zeros(200)]))
+        foot = RIG.T_base_mirror.translation[:2]
+        visible &= (np.linalg.norm(points - foot, axis=1) < REACH - 0.1)
+        visible &= (pixels >= 0.0).all(axis=1)
+        visible &= (pixels < [RIG.camera.width - 1, RIG.camera.height - 1]).all(axis=1)
+        seen = np.flatnonzero(visible)
+        if len(seen) < 2 or len(seen) != seen[-1] - seen[0] + 1:
+            continue
+        start, end = points[seen[0]], points[seen[-1]]
+        if np.linalg.norm(end - start) < 0.3:
+            continue
+        start, end = start + noise * rng.standard_normal(2), end + noise * rng.standard_normal(2)
+        along = (end - start) / np.linalg.norm(end - start)
+        normal = np.array([-along[1], along[0]])
+        length = float(np.linalg.norm(np.diff(pixels[seen], axis=0), axis=1).sum())
+        far = float(np.median(np.linalg.norm(points[seen], axis=1)))
+        strips.append(FloorSegment(
+            normal, float(normal @ start), start, end, length, 0.004 * (1.0 + far**2),
+            np.zeros((0, 2)), line.colour))
+    return tuple(sorted(strips, key=lambda s: -s.weight))
+
+
+def _random_map(rng: np.random.Generator, n: int) -> LineMap:
+    """Lines of 0.8 to 4 m in all directions, spread so that some are always near."""
+    half = 1.2 + 0.25 * n
+    lines = []
+    for _ in range(n):
+        middle, angle = rng.uniform(-half, half, 2), rng.uniform(0.0, np.pi)
+        along = 0.5 * rng.uniform(0.8, 4.0) * np.array([np.cos(angle), np.sin(angle)])
+        lines.append(_line(tuple(middle - along), tuple(middle + along)))
+    return LineMap(tuple(lines))
+
+
+def _cross(strips: tuple[FloorSegment, ...]) -> bool:
+    normals = np.array([s.normal for s in strips])
+    sines = normals[:, 0, None] * normals[None, :, 1] - normals[:, 1, None] * normals[None, :, 0]
+    return bool((np.abs(sines) > 0.2).any())
+
+
+def _near(a: Pose2, b: Pose2, metres: float = 0.06, radians: float = 0.04) -> bool:
+    return (np.hypot(a.x - b.x, a.y - b.y) < metres
+            and abs(float(wrap_angle(a.yaw - b.yaw))) < radians)
+
+
+# ---------------------------------------------------------------- poses from strips
+
+
+@pytest.mark.parametrize('n', [2, 3, 4, 6, 10, 20, 50])
+def test_the_pose_is_among_the_candidates_on_any_map(n: int, table: FloorTable) -> None:
+    rng = np.random.default_rng(100 + n)
+    missed, tried, beaten = [], 0, 0
+    while tried < 6:
+        line_map = _random_map(rng, n)
+        pose = Pose2(*rng.uniform(-0.8, 0.8, 2), rng.uniform(-np.pi, np.pi))
+        strips = _strips(line_map, pose, rng)
+        if len(strips) < 2 or not _cross(strips):
+            continue
+        tried += 1
+        candidates = global_candidates(strips, line_map, table)
+        assert all(a.score >= b.score for a, b in itertools.pairwise(candidates))
+        right = [c for c in candidates if _near(c.pose, pose)]
+        if not right:
+            missed.append((pose, len(strips)))
+            continue
+        # With three lines and their ends in view nothing else explains as much.
+        beaten += len(strips) >= 4 and not _near(candidates[0].pose, pose)
+    assert not missed
+    assert beaten == 0
+
+
+def test_every_pose_on_a_soccer_field_is_found(repository, table: FloorTable) -> None:
+    field = load_map(repository / 'config' / 'soccer_map.yaml')
+    symmetries = map_symmetries(field)
+    assert len(symmetries) == 2
+    rng = np.random.default_rng(8)
+    tried = 0
+    while tried < 12:
+        pose = Pose2(rng.uniform(-9, 9), rng.uniform(-6, 6), rng.uniform(-np.pi, np.pi))
+        strips = _strips(field, pose, rng)
+        # Nearer the goals than the centre, where the boxes tell places apart.
+        if len(strips) < 5 or not _cross(strips):
+            continue
+        tried += 1
+        candidates = global_candidates(strips, field, table)
+        best = candidates[0].score
+        equal = [c.pose for c in candidates if c.score > best - 0.05]
+        assert any(_near(s @ pose, other) for s in symmetries for other in equal)
+        explains = score_pose(pose, strips, field, table)
+        assert explains > best - 0.05
+
+
+@pytest.mark.parametrize(('length', 'width', 'count'), [(4.0, 4.0, 4), (4.0, 3.0, 2)])
+def test_a_symmetric_map_gives_all_its_equal_poses(
+        length: float, width: float, count: int, table: FloorTable) -> None:
+    line_map = _rectangle(length, width)
+    rng = np.random.default_rng(9)
+    for _ in range(5):
+        pose = Pose2(*rng.uniform(-0.9, 0.9, 2), rng.uniform(-np.pi, np.pi))
+        candidates = global_candidates(_strips(line_map, pose, rng, 0.002), line_map, table)
+        best = candidates[0].score
+        assert best > 0.9
+        equal = [c.pose for c in candidates if c.score > 0.9 * best]
+        turns = [Pose2(0.0, 0.0, 2.0 * np.pi * k / count) @ pose for k in range(count)]
+        assert len(equal) == count
+        assert all(any(_near(turn, other) for other in equal) for turn in turns)
+
+
+def test_one_strip_and_parallel_strips_give_no_pose(table: FloorTable) -> None:
+    line_map = LineMap((_line((-2, 1), (2, 1)), _line((-2, -1), (2, -1)), _line((2, -1), (2, 1))))
+    rng = np.random.default_rng(10)
+    strips = _strips(line_map, Pose2(0.3, 0.1, 0.4), rng)
+    angles = np.array([np.arctan2(s.normal[1], s.normal[0]) for s in strips])
+    parallel = tuple(
+        s for s, a in zip(strips, angles) if abs(np.sin(a - angles[0])) < 0.1)
+    assert len(parallel) == 2
+    assert global_candidates(parallel, line_map, table) == ()
+    assert global_candidates(strips[:1], line_map, table) == ()
+    assert global_candidates((), line_map, table) == ()
+    assert score_pose(Pose2(0.0, 0.0, 0.0), (), line_map, table) == 0.0
+
+
+def test_strips_that_are_no_lines_do_not_hide_the_pose(table: FloorTable) -> None:
+    line_map = _random_map(np.random.default_rng(11), 6)
+    rng = np.random.default_rng(12)
+    pose = Pose2(0.2, -0.3, 1.0)
+    strips = _strips(line_map, pose, rng)
+    assert len(strips) >= 4
+    false = []
+    for _ in range(4):
+        start, angle = rng.uniform(-2, 2, 2), rng.uniform(0, np.pi)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        normal = np.array([-along[1], along[0]])
+        false.append(FloorSegment(
+            normal, float(normal @ start), start, start + 0.6 * along, 40.0, 0.01,
+            np.zeros((0, 2))))
+    mixed = tuple(sorted((*strips, *false), key=lambda s: -s.weight))
+    candidates = global_candidates(mixed, line_map, table)
+    assert _near(candidates[0].pose, pose)
+    assert candidates[0].score < global_candidates(strips, line_map, table)[0].score
+
+
+def test_colours_tell_equal_lines_apart(table: FloorTable) -> None:
+    square = _rectangle(4.0, 4.0)
+    coloured = LineMap((replace(square[0], colour='yellow'), *square[1:]))
+    pose, rng = Pose2(0.4, -0.2, 2.0), np.random.default_rng(13)
+    candidates = global_candidates(_strips(coloured, pose, rng, 0.002), coloured, table)
+    assert _near(candidates[0].pose, pose)
+    assert len(candidates) == 1 or candidates[1].score < 0.85 * candidates[0].score
+
+
+def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> None:
+    line_map = _random_map(np.random.default_rng(14), 6)
+    pose = Pose2(0.1, 0.2, -0.7)
+    strips = _strips(line_map, pose, np.random.default_rng(15))
+    there = score_pose(pose, strips, line_map, table)
+    assert there > 0.9
+    for step in (Pose2(0.5, 0.0, 0.0), Pose2(0.0, -0.6, 0.0), Pose2(0.0, 0.0, 0.5)):
+        assert score_pose(pose @ step, strips, line_map, table) < there - 0.3
+
+
+# ---------------------------------------------------------------- symmetries of maps
+
+
+def _looks_the_same(line_map: LineMap, motion: Pose2, tolerance: float) -> bool:
+    """Brute force: points along every moved tape lie on tapes of the same colour."""
+    for line in line_map:
+        points = motion.apply(line.start[:2] + np.linspace(0, 1, 50)[:, None] * (
+            line.end - line.start)[:2])
+        distance = np.full(50, np.inf)
+        for other in line_map:
+            if other.colour != line.colour:
+                continue
+            along = np.clip((points - other.start[:2]) @ other.direction[:2], 0.0, other.length)
+            foot = other.start[:2] + along[:, None] * other.direction[:2]
+            distance = np.minimum(distance, np.linalg.norm(points - foot, axis=1))
+        if distance.max() > tolerance:
+            return False
+    return True
+
+
+@pytest.mark.parametrize(('line_map', 'count'), [
+    (_rectangle(4.0, 4.0), 4), (_rectangle(4.0, 3.0), 2), (_rectangle(4.0, 3.9), 2),
+    (LineMap((*_rectangle(4.0, 4.0), _line((0.0, 0.5), (1.0, 0.5)))), 1),
+    (LineMap((_line((0, 0), (2, 0)), _line((0, 0), (0, 3)))), 1),
+    (LineMap((_line((-1, 0), (1, 0)), _line((0, -1), (0, 1)))), 4),
+    (LineMap((_line((-1, 0), (1, 0)), _line((0, -1), (0, 1), 'red'))), 2),
+    (LineMap(tuple(_line((np.cos(a), np.sin(a)), (2 * np.cos(a), 2 * np.sin(a)))
+                   for a in np.arange(6) * np.pi / 3)), 6)])
+def test_symmetries_are_recognised_from_the_map(line_map: LineMap, count: int) -> None:
+    away = Pose2(3.0, -7.0, 0.4)
+    for moved in (line_map, LineMap(tuple(line.transformed(away) for line in line_map))):
+        motions = map_symmetries(moved)
+        assert len(motions) == count
+        assert _near(motions[0], Pose2(0.0, 0.0, 0.0), 1e-9, 1e-9)
+        assert all(_looks_the_same(moved, motion, 0.01) for motion in motions)
+        # They are a group: one after the other is one of them again.
+        for a in motions:
+            for b in motions:
+                assert any(_near(a @ b, c, 1e-6, 1e-6) for c in motions)
+
+
+def test_random_maps_and_the_arena_have_no_symmetry() -> None:
+    assert len(map_symmetries(ideal_scene().line_map)) == 1
+    for seed in range(20):
+        assert len(map_symmetries(_random_map(np.random.default_rng(seed), 5))) == 1
+
+
+# ---------------------------------------------------------------- strips from blobs
+
+
+def _segments(
+    line_map: LineMap, pose: Pose2, table: FloorTable, patches: tuple[Line, ...] = (),
+    obstacles: tuple[Obstacle, ...] = (), hide: slice | None = None,
+) -> tuple[FloorSegment, ...]:
+    """Strips in a rendered image."""
+    scene = ideal_scene(640, noise=0.01)
+    look = replace(scene.appearance, patches=patches, obstacles=obstacles)
+    scene = replace(scene, line_map=line_map, appearance=look)
+    image = render(scene, pose, np.random.default_rng(0))
+    if hide is not None:
+        image[:, hide] = 205
+    mask = chromatic_mask(image, 'green', 4.5, 0.05, 31)
+    return floor_segments(find_blobs(mask & table.region, 60), table, WIDTH, 'green')
+
+
+def _lies_on(strip: FloorSegment, line: Line, pose: Pose2) -> float:
+    """Largest distance of the strip's ends from a line, metres."""
+    ends = pose.apply(np.array([strip.start, strip.end])) - line.start[:2]
+    return float(np.abs(
+        line.direction[0] * ends[:, 1] - line.direction[1] * ends[:, 0]).max())
+
+
+CROSS = LineMap((_line((-1.0, 0.9), (1.2, 1.1)), _line((0.2, 0.2), (0.1, 1.5))))
+HERE = Pose2(0.1, 0.0, 0.2)
+
+
+def test_one_blob_over_two_crossing_tapes_is_split(table: FloorTable) -> None:
+    strips = _segments(CROSS, HERE, table)
+    assert len(strips) == 2
+    for line in CROSS:
+        on = [s for s in strips if _lies_on(s, line, HERE) < 0.04]
+        assert len(on) == 1
+        assert np.linalg.norm(on[0].end - on[0].start) == pytest.approx(line.length, abs=0.12)
+
+
+def test_touching_tapes_are_split(table: FloorTable) -> None:
+    corner = LineMap((_line((-1.0, 1.0), (1.0, 1.0)), _line((1.0, 1.0), (1.0, -0.8))))
+    strips = _segments(corner, HERE, table)
+    assert len(strips) == 2
+    for line in corner:
+        assert sum(_lies_on(s, line, HERE) < 0.05 for s in strips) == 1
+
+
+def test_a_tape_cut_in_pieces_is_joined(table: FloorTable) -> None:
+    whole = LineMap((_line((-1.2, 0.9), (1.2, 0.9)), _line((-1.2, -3.9), (1.2, -3.9))))
+    pixels, _ = RIG.project(np.array([[*HERE.inverse().apply(np.array([0.0, 0.9])), 0.0]]))
+    middle = int(pixels[0, 0])
+    strips = _segments(whole, HERE, table, hide=slice(middle - 8, middle + 8))
+    on = [s for s in strips if _lies_on(s, whole[0], HERE) < 0.04]
+    assert len(on) == 1
+    assert np.linalg.norm(on[0].end - on[0].start) == pytest.approx(2.4, abs=0.12)
+
+
+def _sheet(x: float, y: float, width: float, length: float, angle: float = 0.3) -> Line:
+    along = 0.5 * length * np.array([np.cos(angle), np.sin(angle), 0.0])
+    middle = np.array([x, y, 0.0])
+    return Line(middle - along, middle + along, width=width, colour='green')
+
+
+@pytest.mark.parametrize('sheet', [
+    _sheet(0.8, 0.5, 0.4, 0.4), _sheet(-0.7, 0.9, 0.25, 0.5), _sheet(0.9, -0.9, 0.6, 0.8)])
+def test_sheets_on_the_floor_are_no_lines(sheet: Line, table: FloorTable) -> None:
+    assert _segments(CROSS, Pose2(30.0, 0.0, 0.0), table) == ()
+    # The tapes are far away: all that is green in view is the sheet.
+    at = Pose2(30.0, 0.0, 0.0)
+    assert _segments(CROSS, at, table, patches=(sheet.transformed(at),)) == ()
+
+
+@pytest.mark.parametrize(('x', 'y', 'radius', 'top'), [
+    (1.0, 0.3, 0.2, 0.6), (-0.9, 0.8, 0.25, 0.9), (0.2, -1.4, 0.15, 0.5)])
+def test_solids_are_no_lines(
+        x: float, y: float, radius: float, top: float, table: FloorTable) -> None:
+    at = Pose2(30.0, 0.0, 0.0)
+    green = (0.20, 0.72, 0.20)
+    bin_ = Obstacle(30.0 + x, y, radius, top, colour=green)
+    assert _segments(CROSS, at, table, obstacles=(bin_,)) == ()
+
+
+def test_tapes_are_found_among_sheets_and_solids(table: FloorTable) -> None:
+    green = (0.20, 0.72, 0.20)
+    strips = _segments(
+        CROSS, HERE, table, patches=(_sheet(1.0, -0.6, 0.4, 0.5),),
+        obstacles=(Obstacle(-1.2, -0.5, 0.2, 0.6, colour=green),))
+    for line in CROSS:
+        assert sum(_lies_on(s, line, HERE) < 0.05 for s in strips) == 1
+    assert len(strips) == 2
+
+
+def test_same_pose_is_close_in_place_and_heading() -> None:
+    a = Pose2(1.0, 2.0, np.pi - 0.02)
+    assert same_pose(a, Pose2(1.1, 2.1, -np.pi + 0.02))
+    assert not same_pose(a, Pose2(1.0, 2.0, np.pi - 0.3))
+    assert not same_pose(a, Pose2(1.3, 2.0, np.pi - 0.02))
