@@ -22,19 +22,17 @@ the tapes end somewhere, and a pose from which they would have to go on beyond t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.global_pose import solve
-from nccs_pose.estimation.pose_monomials import gram, monomial_rows
+from nccs_pose.estimation.pose_monomials import monomial_rows
 from nccs_pose.estimation.refine import refine
-from nccs_pose.estimation.residual import lines_in_base, side_gradient
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.rig import Rays, Rig
+from nccs_pose.geometry.rig import Rig
 import numpy as np
-from numpy.typing import NDArray
 
 _HEADINGS = 36
 _REFINED = 4  # best headings that are refined and judged again
@@ -42,79 +40,73 @@ _EXPECTED = 8.0  # px: what a rough rig may be off without being wrong
 _MOST_POINTS = 160
 
 
-@dataclass(frozen=True, eq=False)
 class _Frame:
-    """One frame's rays with the lines (N, 3) that they should meet."""
+    """One frame's rays with the lines that they should meet, for K poses at a time."""
 
-    rays: Rays
-    line_map: LineMap
-    label: NDArray[np.intp]
-    rows: Array
-
-    @classmethod
-    def of(cls, rig: Rig, line_map: LineMap, frame: FrameObservation) -> _Frame:
+    def __init__(self, rig: Rig, line_map: LineMap, frame: FrameObservation) -> None:
         rays = rig.back_project(frame.points.pixels)
         keep = np.flatnonzero(rays.hit)
         keep = keep[np.linspace(0, len(keep) - 1, min(len(keep), _MOST_POINTS)).astype(int)]
-        rays, label = rays[keep], frame.points.label[keep]
-        rows = monomial_rows(
-            rays.direction, rays.moment, line_map.directions[label], line_map.moments[label])
-        return cls(rays, line_map, label, rows)
+        self.rays, self.label = rays[keep], frame.points.label[keep]
+        lines = line_map.directions[self.label], line_map.moments[self.label]
+        self.lines = lines
+        self._rows = monomial_rows(self.rays.direction, self.rays.moment, *lines)
+        self._slopes = monomial_rows(
+            np.moveaxis(self.rays.direction_jacobian, 2, 0),
+            np.moveaxis(self.rays.moment_jacobian, 2, 0), *lines)
+        floor, reaches = self.rays.floor_points()
+        start = line_map.starts[self.label]
+        self._floor, self._start, self._along = floor, start[:, :2], lines[0][:, :2]
+        self._length = line_map.lengths[self.label]
+        # Where a line ends is judged on the floor; one that hangs above it has no end there.
+        self._ends = reaches & (np.abs(start[:, 2]) < 0.01) & (np.abs(lines[0][:, 2]) < 0.01)
 
-    def residual(self, pose: Pose2) -> tuple[Array, Array]:
-        """Sampson distance (N,), px, and |dS/du| (N,), metres per pixel."""
-        d, mu = self.line_map.directions[self.label], self.line_map.moments[self.label]
-        slope = np.linalg.norm(side_gradient(self.rays, d, mu, pose), axis=1)
-        slope = np.maximum(slope, 1e-12)
-        d, mu = lines_in_base(d, mu, pose)
-        side = (np.einsum('ni,ni->n', self.rays.direction, mu)
-                + np.einsum('ni,ni->n', self.rays.moment, d))
-        return side / slope, slope
+    def residual(self, poses: Array) -> tuple[Array, Array]:
+        """Sampson distances (K, N), px, and |dS/du| (K, N), metres per pixel, at poses (K, 3)."""
+        x, y, yaw = poses.T
+        c, s = np.cos(yaw), np.sin(yaw)
+        monomials = np.stack([c, s, x, y, c * x + s * y, c * y - s * x, np.ones_like(x)])
+        du, dv = self._slopes @ monomials
+        slope = np.maximum(np.hypot(du, dv), 1e-12).T
+        return (self._rows @ monomials).T / slope, slope
 
-    def overshoot(self, pose: Pose2) -> Array:
-        """How far beyond the line's ends the ray passes it (N,), metres."""
-        d, mu = lines_in_base(
-            self.line_map.directions[self.label], self.line_map.moments[self.label], pose)
-        r, w = self.rays.direction, self.rays.moment
-        # Point of the line nearest to the ray, and where between its ends it lies.
-        cross = np.cross(d, r)
-        foot = np.cross(d, mu)
-        along = np.einsum('ni,ni->n', np.cross(r, w) - foot, d - np.einsum(
-            'ni,ni->n', d, r)[:, None] * r) / np.maximum(
-                np.einsum('ni,ni->n', cross, cross), 1e-9)
-        start = np.einsum('ni,ni->n', pose.inverse().apply(
-            self.line_map.starts[self.label]) - foot, d)
-        along = along - start
-        return np.maximum(np.maximum(-along, along - self.line_map.lengths[self.label]), 0.0)
+    def overshoot(self, poses: Array) -> Array:
+        """How far beyond the line's ends the floor point lies (K, N), metres."""
+        x, y, yaw = poses.T[:, :, None]
+        c, s = np.cos(yaw), np.sin(yaw)
+        px, py = self._floor.T
+        at_x, at_y = c * px - s * py + x - self._start[:, 0], s * px + c * py + y
+        along = at_x * self._along[:, 0] + (at_y - self._start[:, 1]) * self._along[:, 1]
+        beyond = np.maximum(np.maximum(-along, along - self._length), 0.0)
+        return np.where(self._ends, beyond, 0.0)
 
-    def score(self, pose: Pose2) -> float:
-        """How badly the pose explains the points: a robust mean of distances to the tapes."""
-        residual, slope = self.residual(pose)
-        beyond = self.overshoot(pose) * np.abs(self.rays.direction[:, 2]) / slope
+    def scores(self, poses: Array) -> Array:
+        """How badly poses (K, 3) explain the points: robust means of distances to the tapes."""
+        residual, slope = self.residual(poses)
+        beyond = self.overshoot(poses) * np.abs(self.rays.direction[:, 2]) / slope
         squared = (residual**2 + 0.1 * beyond**2) / _EXPECTED**2
-        return float(np.log1p(squared).mean())
+        return np.log1p(squared).mean(axis=1)
 
-    def at_heading(self, yaw: float) -> Pose2:
-        """The best position for that heading; S is linear in it."""
-        pose = Pose2(0.0, 0.0, yaw)
-        weight = np.ones(len(self.rays))
+    def at_headings(self, yaw: Array) -> Array:
+        """Poses (K, 3): for each heading (K,) its best position; S is linear in it."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        # S in the monomials (x, y, 1) at each heading.
+        form = np.zeros((len(yaw), 7, 3))
+        form[:, 0, 2], form[:, 1, 2], form[:, 6, 2] = c, s, 1.0
+        form[:, 2, 0] = form[:, 3, 1] = 1.0
+        form[:, 4, 0], form[:, 4, 1], form[:, 5, 0], form[:, 5, 1] = c, s, -s, c
+        rows = self._rows @ form
+        weight = np.ones((len(yaw), len(self._rows)))
+        poses = np.zeros((len(yaw), 3))
+        poses[:, 2] = yaw
         for _ in range(3):
-            pose = _best_position(gram(self.rows, weight), yaw)
-            residual, slope = self.residual(pose)
+            q = np.matmul(np.swapaxes(rows, 1, 2), rows * weight[:, :, None])
+            trace = q[:, 0, 0] + q[:, 1, 1]
+            block = q[:, :2, :2] + (1e-9 * trace + 1e-300)[:, None, None] * np.eye(2)
+            poses[:, :2] = -np.linalg.solve(block, q[:, :2, 2:])[:, :, 0]
+            residual, slope = self.residual(poses)
             weight = 1.0 / (slope**2 * (1.0 + (residual / _EXPECTED) ** 2))
-        return pose
-
-
-def _best_position(matrix: Array, yaw: float) -> Pose2:
-    """Minimise a Gram form (7, 7) over (x, y) at a fixed yaw."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    form = np.zeros((7, 3))
-    form[0, 2], form[1, 2], form[6, 2], form[2, 0], form[3, 1] = c, s, 1.0, 1.0, 1.0
-    form[4:6, :2] = [[c, s], [-s, c]]
-    q = form.T @ matrix @ form
-    block = q[:2, :2] + 1e-9 * np.trace(q[:2, :2]) * np.eye(2) + 1e-300 * np.eye(2)
-    x, y = -np.linalg.solve(block, q[:2, 2])
-    return Pose2(float(x), float(y), yaw)
+        return poses
 
 
 def first_pose(
@@ -126,28 +118,28 @@ def first_pose(
 
     :param rough: whether the rig may be millimetres off; if not, the closed form is enough.
     """
-    data = _Frame.of(rig, line_map, frame)
+    data = _Frame(rig, line_map, frame)
     if len(data.rays) < 6 or len(np.unique(data.label)) < 2:
         return None, float('inf')
     if rough:
-        poses = [data.at_heading(yaw) for yaw in np.linspace(-np.pi, np.pi, _HEADINGS, False)]
-        order = np.argsort([data.score(pose) for pose in poses])
-        poses = [poses[index] for index in order[:_REFINED]]
+        poses = data.at_headings(np.linspace(-np.pi, np.pi, _HEADINGS, endpoint=False))
+        poses = poses[np.argsort(data.scores(poses))[:_REFINED]]
     else:
-        poses = [solution.pose for solution in solve(
-            data.rays, line_map.directions, line_map.moments, data.label)]
-    best, lowest = None, float('inf')
+        poses = np.array([solution.pose.as_array() for solution in solve(
+            data.rays, line_map.directions, line_map.moments, data.label)])
+    found = []
     for pose in poses:
         try:
-            refined = refine(
-                data.rays, line_map.directions[data.label], line_map.moments[data.label],
-                pose, sigma=2.0, max_iterations=15)
+            found.append(refine(
+                data.rays, *data.lines, Pose2.from_array(pose), sigma=2.0,
+                max_iterations=15).pose)
         except EstimationError:
             continue
-        score = data.score(refined.pose)
-        if score < lowest:
-            best, lowest = refined.pose, score
-    return best, lowest
+    if not found:
+        return None, float('inf')
+    scores = data.scores(np.array([pose.as_array() for pose in found]))
+    best = int(np.argmin(scores))
+    return found[best], float(scores[best])
 
 
 def first_poses(

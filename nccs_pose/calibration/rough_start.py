@@ -36,6 +36,8 @@ from numpy.typing import NDArray
 _ROUNDS = 6
 _GOOD_FRAME = 0.85  # fraction of a frame's points that must be inliers
 _GOOD_SCALE = 3.0  # robust residual in units of the noise as told
+_SAMPLED = 6  # frames by which starts are judged
+_TRIED = 3  # starts that are tried beside the rough rig
 _GOOD_FRAMES = 0.7  # fraction of frames that must agree
 
 
@@ -74,7 +76,7 @@ def start(
     :raises CalibrationError: if no frame has a pose, or nothing fits.
     """
     best, failure = None, None
-    for theta in _starts(parameters):
+    for theta in _starts(parameters, frames):
         try:
             found = _settle(parameters, frames, theta, poses)
         except (CalibrationError, GeometryError) as error:
@@ -89,9 +91,25 @@ def start(
     return best
 
 
-def _starts(parameters: RigParameters) -> Iterator[Array]:
-    """The rough rig, then rigs in its neighbourhood."""
+def _starts(parameters: RigParameters, frames: list[FrameObservation]) -> Iterator[Array]:
+    """The rough rig, then the rigs in its neighbourhood under which frames look best."""
     yield np.zeros(len(parameters))
+    rows = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLED)).round().astype(int)
+    some = [frames[i] for i in rows]
+    judged = []
+    for theta in _neighbours(parameters):
+        try:
+            model = parameters.model(theta)
+        except GeometryError:
+            continue
+        scores = first_poses(model.rig, model.line_map, some)[1]
+        judged.append((float(np.median(scores)), theta))
+    judged.sort(key=lambda entry: entry[0])
+    for _, theta in judged[:_TRIED]:
+        yield theta
+
+
+def _neighbours(parameters: RigParameters) -> Iterator[Array]:
     for name in ('cop_y', 'cop_z', 'camera_x', 'camera_y'):
         for sign in (1.0, -1.0):
             theta = np.zeros(len(parameters))
@@ -108,7 +126,7 @@ def _settle(
     poses = np.full((len(frames), 3), np.nan) if poses is None else poses.copy()
     lost = np.flatnonzero(np.isnan(poses[:, 0]))
     poses[lost] = first_poses(model.rig, model.line_map, [frames[i] for i in lost])[0]
-    result, agreement, used = None, 0.0, np.empty(0, dtype=np.intp)
+    result, agreement, used = None, -1.0, np.empty(0, dtype=np.intp)
     for _ in range(_ROUNDS):
         used = np.flatnonzero(np.isfinite(poses[:, 0]))
         if len(used) < 2:
@@ -120,9 +138,10 @@ def _settle(
         theta, poses[used] = result.theta, result.poses
         good = np.zeros(len(frames), dtype=bool)
         good[used] = [result.inlier[rows].mean() >= _GOOD_FRAME for rows in observations.slices()]
-        agreement = float(good.mean())
         bad = np.flatnonzero(~good)
-        if not len(bad):
+        improved = good.mean() > agreement
+        agreement = float(good.mean())
+        if not len(bad) or not improved:
             break
         again = first_poses(
             result.model.rig, result.model.line_map, [frames[i] for i in bad])[0]
