@@ -19,11 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.pose import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8}
 

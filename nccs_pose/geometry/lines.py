@@ -20,10 +20,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import numpy as np
-
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
+import numpy as np
 
 
 @dataclass(frozen=True, eq=False)

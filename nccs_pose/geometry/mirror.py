@@ -20,11 +20,10 @@ from dataclasses import dataclass
 from functools import cached_property
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.pose import Array
+import numpy as np
+from numpy.typing import NDArray
 
 _CONE_TOLERANCE = 1e-12
 

@@ -20,10 +20,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
+from nccs_pose.errors import GeometryError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from nccs_pose.errors import GeometryError
 
 Array = NDArray[np.float64]
 

@@ -18,14 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import Array, checked_rotation, RigidTransform
 from nccs_pose.geometry.projection import reflect_points
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, eq=False)
