@@ -104,6 +104,11 @@ class User:
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
 
+    def meet(self, node: Process, name: str = 'localiser') -> None:
+        """Wait until the node is active and heard: discovery can take a few seconds."""
+        assert self.wait(
+            lambda: self.value(f'{name}: pose', 'lifecycle') == 'active'), node.output
+
     def publisher(self, kind: type, topic: str, node: str = 'localiser') -> Any:
         """A publisher that the node already knows of."""
         publisher = self.node.create_publisher(kind, topic, 100)

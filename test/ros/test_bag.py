@@ -30,7 +30,6 @@ from nccs_pose.files.bags import BagReader
 from nccs_pose.files.serialised_bag import SerialisedBag
 from nccs_pose.ros.conversions import pose_to_planar, stamp_to_ns
 import numpy as np
-from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo
 
@@ -44,6 +43,7 @@ def test_bag_is_localised_over_dds(world, repository):
         '--params-file', 'config/room.yaml', '-r', f'image/compressed:={IMAGE}',
         '-r', 'camera_info:=/camera/camera_info', use_sim_time=True)
     poses = user.listen(PoseWithCovarianceStamped, 'pose')
+    user.meet(node)
     player = world.start('player', BAG, '--rate', '2.5', '--clock', '--wait-for', IMAGE)
     assert user.wait(lambda: not player.running(), 60.0)
     assert player.wait() == 0, player.output
@@ -71,10 +71,11 @@ def test_bag_is_localised_over_dds(world, repository):
 def test_player_keeps_bytes_order_and_timing(world, repository):
     user = world.user
     truths = user.listen(PoseStamped, '/ground_truth/pose')
-    infos: list[tuple[float, CameraInfo]] = []
+    infos: list[tuple[float, bytes]] = []
     clocks = user.listen(Clock, '/clock')
     user.node.create_subscription(
-        CameraInfo, '/camera/camera_info', lambda m: infos.append((time.monotonic(), m)), 100)
+        CameraInfo, '/camera/camera_info', lambda m: infos.append((time.monotonic(), m)), 100,
+        raw=True)
     player = world.start(
         'player', BAG, '--rate', '4', '--start-offset', '20.2', '--clock', '--topics',
         '/camera/camera_info', '/ground_truth/pose', '--wait-for', '/camera/camera_info',
@@ -86,11 +87,15 @@ def test_player_keeps_bytes_order_and_timing(world, repository):
             (received, data) for topic, received, data in bag.messages(
                 ['/camera/camera_info'], bag.start_ns + 20_200_000_000)]
         begin, end = bag.start_ns + 20_200_000_000, bag.end_ns
-    assert [serialize_message(m) for _, m in infos] == [data for _, data in recorded]
+    # The middleware may pad a message at its end.
+    assert len(infos) == len(recorded)
+    for (_, played), (_, data) in zip(infos, recorded):
+        assert played[:len(data)] == data
+        assert len(played) - len(data) < 4
     assert len(truths) > 200
     # Four times as fast: compared by the longest stretch, which a loaded machine hardly changes.
-    played = infos[-1][0] - infos[0][0]
-    assert played == pytest.approx(1e-9 * (recorded[-1][0] - recorded[0][0]) / 4.0, abs=0.4)
+    lasted = infos[-1][0] - infos[0][0]
+    assert lasted == pytest.approx(1e-9 * (recorded[-1][0] - recorded[0][0]) / 4.0, abs=0.4)
     stamps = [stamp_to_ns(c.clock) for c in clocks]
     assert stamps == sorted(stamps)
     assert begin - 10**9 < stamps[0]
