@@ -270,7 +270,8 @@ def test_rigs_that_cannot_be_are_refused_by_name() -> None:
     with pytest.raises(GeometryError, match='does not see the mirror'):
         Rig(good.mirror, good.camera, good.cop, np.eye(3), MOUNTING)
     with pytest.raises(GeometryError, match='x must be 0'):
-        Rig(good.mirror, good.camera, good.cop + np.array([0.001, 0, 0]), good.R_mirror_camera, MOUNTING)
+        beside = good.cop + np.array([0.001, 0.0, 0.0])
+        Rig(good.mirror, good.camera, beside, good.R_mirror_camera, MOUNTING)
     with pytest.raises(GeometryError, match='orthonormal'):
         Rig(good.mirror, good.camera, good.cop, 1.1 * good.R_mirror_camera, MOUNTING)
 
