@@ -61,6 +61,8 @@ class Alignment:
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
     :ivar missing: map lines that should be seen plainly and are not there.
+    :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
+        NaN where the line is not in view.
     :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
     """
@@ -72,6 +74,7 @@ class Alignment:
     explained: float
     lines: tuple[int, ...]
     missing: tuple[int, ...]
+    support: Array
     misfit: float
     colours: tuple[LineColour, ...]
 
@@ -214,8 +217,15 @@ class Aligner:
         return Alignment(
             refinement.pose, correlation * refinement.covariance, refinement, points,
             float(worth[index].sum() / worth.sum()),
-            tuple(int(k) for k in np.unique(points.label)), _missing(bands, index), misfit,
-            colours)
+            tuple(int(k) for k in np.unique(points.label)), _missing(bands, index),
+            _support(bands, index, len(self._map)), misfit, colours)
+
+
+def _support(bands: Bands, found: NDArray[np.intp], lines: int) -> Array:
+    """Fraction of each line's stations that were found (L,), NaN where it has none."""
+    predicted = np.bincount(bands.label, minlength=lines)
+    rests = np.bincount(bands.label[found], minlength=lines)
+    return np.where(predicted > 0, rests / np.maximum(predicted, 1), np.nan)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:

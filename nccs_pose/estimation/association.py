@@ -44,6 +44,8 @@ _BEYOND = 0.2
 _JOINED = 0.2
 # Samples on each strip and on each map line.
 _SAMPLES = 12
+# Fewer samples than this on lines refine no pose.
+_LEAST_SAMPLES = 4
 # Tapes whose ends are this close look the same, metres.
 _SAME_TAPE = 0.05
 # Poses this close are the same, metres and rad.
@@ -88,7 +90,7 @@ def global_candidates(
     poses = poses[np.argsort(-claimed, kind='stable')[:_CLOSE]]
     score = scorer.score(poses)
     order = np.argsort(-score, kind='stable')[:_REFINED]
-    refined = np.array([scorer.refine(pose) for pose in poses[order]])
+    refined = scorer.refine(poses[order])
     score = scorer.score(refined)
     return _distinct(refined, score, most)
 
@@ -260,24 +262,23 @@ class _Scorer:
         claimed, explained = self.claimed(poses), self.explained(poses)
         return 2.0 * claimed * explained / np.maximum(claimed + explained, 1e-9)
 
-    def refine(self, pose: Array) -> Array:
-        """Lay the strips on their lines by least squares on the floor, from one pose (3,)."""
+    def refine(self, poses: Array) -> Array:
+        """Lay the strips on their lines by least squares on the floor, from poses (H, 3)."""
+        lines, inverse = self._lines, 1.0 / self._tolerance
         for _ in range(3):
-            on, which, _ = self._on_lines(pose[None])
-            chosen, line = on[0], which[0]
-            if chosen.sum() < 4:
-                return pose
-            c, s = np.cos(pose[2]), np.sin(pose[2])
-            turned = self._points[chosen] @ np.array([[c, s], [-s, c]])
-            normal = self._lines.normal[line[chosen]]
-            error = (np.einsum('ni,ni->n', normal, turned + pose[:2])
-                     - self._lines.offset[line[chosen]])
-            by_yaw = normal[:, 1] * turned[:, 0] - normal[:, 0] * turned[:, 1]
-            jacobian = np.column_stack([normal, by_yaw]) / self._tolerance[chosen, None]
-            normal_matrix = jacobian.T @ jacobian + 1e-6 * np.eye(3)
-            pose = pose - np.linalg.solve(
-                normal_matrix, jacobian.T @ (error / self._tolerance[chosen]))
-        return pose
+            on, which, _ = self._on_lines(poses)
+            c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+            x = c * self._points[:, 0] - s * self._points[:, 1]
+            y = s * self._points[:, 0] + c * self._points[:, 1]
+            nx, ny = lines.normal[which, 0], lines.normal[which, 1]
+            error = nx * (x + poses[:, :1]) + ny * (y + poses[:, 1:2]) - lines.offset[which]
+            weight = on * inverse
+            jacobian = np.stack([nx, ny, ny * x - nx * y], axis=2) * weight[..., None]
+            normal_matrix = np.einsum('hpi,hpj->hij', jacobian, jacobian) + 1e-6 * np.eye(3)
+            slope = np.einsum('hpi,hp->hi', jacobian, error * weight)
+            step = np.linalg.solve(normal_matrix, slope[..., None])[..., 0]
+            poses = np.where(on.sum(axis=1)[:, None] < _LEAST_SAMPLES, poses, poses - step)
+        return poses
 
 
 def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:
