@@ -133,7 +133,7 @@ lines:
     ('cop: [0.0, -0.012, 0.06]', 'cop: [0.0, -0.012, 0.01]', ['camera', 'inside the mirror']),
     ('cop: [0.0, -0.012, 0.06]', 'cop: [0.0, 0.5, 0.06]', ['camera', 'not see the mirror']),
     ('cop: [0.0', 'cop: [.inf', ['camera.cop[0]', 'finite', 'inf']),
-    ('mounting:', 'mountings:', ['mounting', 'missing']),
+    ('mounting:', 'mountings:', ['mounting', 'missing', 'is mountings meant?']),
     ('rpy: [3.1485739705977704, ', 'rpy: [', ['mounting.rpy', '3 numbers', '2']),
     ('mirror:', 'mirror: [1', ['line']),
 ])

@@ -141,7 +141,11 @@ class Section:
         if key in self._content:
             return self._content[key]
         if default is _REQUIRED:
-            raise self.error(key, f'is missing: it must be {accepted}')
+            unread = [name for name in self._content if name not in self._known]
+            close = get_close_matches(key, unread, n=1)
+            raise self.error(
+                key, f'is missing: it must be {accepted}'
+                + (f' (is {self.key(close[0])} meant?)' if close else ''))
         return default
 
     def section(self, key: str) -> Section:
