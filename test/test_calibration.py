@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-import cv2
 from nccs_pose.calibration.adjustment import adjust, ArrowSystem, Problem
 from nccs_pose.calibration.frames import choose, frame_information
 from nccs_pose.calibration.gauge import gauges, pose_uncertainty, weak_directions
@@ -30,7 +29,6 @@ from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import left_jacobian, RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.procedure import calibrate
-from nccs_pose.calibration.rim import circle_poses, find_outline, outline_points, rig_from_outline
 from nccs_pose.calibration.sensitivity import side_sensitivity
 from nccs_pose.errors import CalibrationError
 from nccs_pose.estimation.residual import side, side_gradient
@@ -456,61 +454,6 @@ def test_the_monitor_says_what_moved_and_by_how_much():
     monitor.reset()
     drive_past(monitor, rig, turned, np.random.default_rng(3))
     assert 'the camera turned by about 0.2' in monitor.verdict().words
-
-
-def rimmed(name, radius):
-    return replace(RIGS[name], mirror=replace(RIGS[name].mirror, rim_radius=radius))
-
-
-def test_one_of_two_circles_is_the_one_that_was_seen():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        axis = rotation_exp([*rng.uniform(-0.6, 0.6, 2), 0.0]) @ [0.0, 0.0, -1.0]
-        centre = np.array([*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.05, 0.1)])
-        across = np.linalg.svd(axis[None])[2][1:]
-        angle = np.linspace(0.0, 6.0, 50)[:, None]
-        points = centre + 0.012 * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
-        pair = circle_poses(points / np.linalg.norm(points, axis=1, keepdims=True), 0.012)
-        error = min(np.abs(c.centre - centre).max() + np.abs(c.axis - axis).max() for c in pair)
-        assert error < 1e-8
-
-
-@pytest.mark.parametrize('name', ['hyperbolic', 'parabolic'])
-def test_the_rim_gives_the_camera_back(name):
-    rig = rimmed(name, 0.005)
-    rough = disturbed(rig, np.random.default_rng(1), cop=3e-3, tilt=np.deg2rad(2.0))
-    found = rig_from_outline(rough, outline_points(rig))
-    np.testing.assert_allclose(found.cop, rig.cop, atol=1e-7)
-    np.testing.assert_allclose(found.R_mirror_camera, rig.R_mirror_camera, atol=1e-6)
-
-
-def test_the_outline_of_a_sphere_gives_its_place_before_the_camera():
-    rig = rimmed('arena', 0.032)
-    rough = disturbed(rig, np.random.default_rng(1), cop=3e-3, tilt=np.deg2rad(2.0))
-    found = rig_from_outline(rough, outline_points(rig))
-    # The turn about the centre is the rough rig's; the centre in the camera's frame is not.
-    np.testing.assert_allclose(
-        found.R_mirror_camera.T @ found.cop, rig.R_mirror_camera.T @ rig.cop, atol=1e-9)
-    with pytest.raises(CalibrationError, match='no rim_radius'):
-        rig_from_outline(RIGS['parabolic'], outline_points(rig))
-
-
-def test_the_outline_is_found_in_a_noisy_image():
-    rig = rimmed('parabolic', 0.005)
-    rng = np.random.default_rng(1)
-    image = np.full((800, 1200, 3), 60, np.uint8)
-    polygon = np.round(outline_points(rig, 720)).astype(np.int32)
-    cv2.fillPoly(image, [polygon], (150, 160, 150))
-    cv2.line(image, (500, 300), (700, 420), (20, 200, 30), 6)
-    image = np.clip(image + rng.normal(0.0, 6.0, image.shape), 0, 255).astype(np.uint8)
-    rough = disturbed(rig, rng, cop=1.5e-3, tilt=np.deg2rad(1.5))
-    found = rig_from_outline(rough, find_outline(rough, [image]))
-    for before, after, true in (
-            (rough.cop, found.cop, rig.cop),
-            (rough.R_mirror_camera, found.R_mirror_camera, rig.R_mirror_camera)):
-        assert np.linalg.norm(after - true) < np.linalg.norm(before - true) / 2.5
-    with pytest.raises(CalibrationError, match='outline was not found'):
-        find_outline(rough, [np.full((800, 1200, 3), 90, np.uint8)])
 
 
 def test_cells_average_what_falls_into_them():

@@ -14,10 +14,24 @@
 
 """Is the calibration still good? Watched while driving, from what the localiser measures anyway.
 
-Every tracked frame pulls at the rig: the slope of its squared residuals, with its pose left free.
-Under a true rig the pulls of many frames cancel; under a rig that has moved they add up, and one
-Gauss-Newton step says where to. It is reported when the pulls are too regular to be chance and
-when what they ask for would move the poses by more than a tolerance.
+Every tracked frame pulls at the rig: the slope g of its squared residuals, with its pose left
+free, and their curvature I. Under a true rig the pulls of many places cancel; under a rig that has
+moved they add up, and one Gauss-Newton step d = -(sum I)^-1 sum g says where to. It is reported
+when the sum is too large for chance and when the step would move the poses by more than a
+tolerance. Chance is as large as the noise that the image shows, or as what the step leaves of the
+pulls, g + I d, shows it to be. Frames from one place share their errors, so a place counts once,
+however long the robot stands there.
+
+Feed it every answer of the localiser, whatever its state, and ask when the diagnostics are due::
+
+    monitor = CalibrationMonitor(rig, line_map)  # those of the localiser
+    monitor.add(localiser.process(stamp_ns, image))  # in the order of the images
+    verdict = monitor.verdict()
+    if verdict.condition is Condition.SUSPECT:
+        warn(verdict.words)  # 'residuals suggest the mirror moved by about 0.3 mm ...'
+
+:meth:`CalibrationMonitor.add` takes a millisecond or two, :meth:`CalibrationMonitor.verdict`
+about one; :meth:`CalibrationMonitor.reset` when the rig or the map is another.
 """
 
 from __future__ import annotations
@@ -33,14 +47,15 @@ from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.options import check_options, option
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import f
 
 _CAUCHY = 2.385
-_LEAST_LINES = 3
+_LEAST_LINES = 2
+_PLACE = np.array([0.05, 0.05, 0.1])  # m, m, rad: frames nearer than this share their errors
 
 
 @dataclass(frozen=True)
@@ -51,9 +66,10 @@ class MonitorOptions:
     """
 
     memory: int = option(
-        200, low=10, high=100000, doc='Frames after which what was seen is forgotten to 1/e.')
+        200, low=10, high=100000, doc='Places after which the first one is forgotten.')
     least_frames: int = option(
-        15, low=2, high=10000, doc='Frames before anything is said.')
+        15, low=5, high=10000, doc='Places from which frames must have come before anything is '
+        'said.')
     false_alarm: float = option(
         1e-4, low=1e-12, high=0.5, doc='Probability that noise alone is called structure.')
     pose_error: float = option(
@@ -82,9 +98,9 @@ class Verdict:
 
     :ivar condition: good, suspect or unknown.
     :ivar words: a sentence for diagnostics.
-    :ivar frames: how many frames it rests on.
-    :ivar statistic: regularity of the pulls, chi-squared with ``freedom`` degrees under noise.
-    :ivar limit: what noise alone does not exceed.
+    :ivar frames: from how many places frames have come that it rests on.
+    :ivar statistic: the squared sum of the pulls in units of chance.
+    :ivar limit: what chance does not exceed, but for ``false_alarm``.
     :ivar pose_error: by how much poses would move under the rig that the residuals ask for,
         metres.
     """
@@ -97,8 +113,39 @@ class Verdict:
     pose_error: float
 
 
+@dataclass(eq=False)
+class _Place:
+    """The mean of what frames from one place say.
+
+    :ivar pose: of the first of them (3,).
+    :ivar information: I (P, P).
+    :ivar slope: g (P,).
+    :ivar gain: -dpose/dtheta (3, P).
+    :ivar frames: how many.
+    """
+
+    pose: Array
+    information: Array
+    slope: Array
+    gain: Array
+    frames: int = 1
+
+    def holds(self, pose: Array) -> bool:
+        """Whether a pose (3,) is of this place."""
+        off = pose - self.pose
+        off[2] = wrap_angle(off[2])
+        return bool((np.abs(off) < _PLACE).all())
+
+    def average(self, information: Array, slope: Array, gain: Array) -> None:
+        """Take one more frame into the mean."""
+        self.frames += 1
+        self.information += (information - self.information) / self.frames
+        self.slope += (slope - self.slope) / self.frames
+        self.gain += (gain - self.gain) / self.frames
+
+
 class CalibrationMonitor:
-    """Accumulates pulls at the rig, frame by frame; a few milliseconds each.
+    """Accumulates pulls at the rig, frame by frame.
 
     :param rig: the rig that the localiser uses.
     :param line_map: the map that it uses.
@@ -115,14 +162,14 @@ class CalibrationMonitor:
 
     def reset(self) -> None:
         """Forget everything."""
-        p = len(self._parameters)
-        self._information, self._scatter = np.zeros((p, p)), np.zeros((p, p))
-        self._slope, self._weight, self._frames = np.zeros(p), 0.0, 0
-        self._gains: deque[tuple[Array, Array]] = deque(maxlen=50)
+        self._places: deque[_Place] = deque(maxlen=self.options.memory)
+        self._asked = self._mute = 0
 
     def add(self, estimate: Estimate) -> None:
-        """Look at one answer of the localiser; only tracked ones with three lines count."""
-        if estimate.state is State.TRACKING and estimate.pose is not None and estimate.points:
+        """Look at one answer of the localiser; only tracked ones with two lines count."""
+        if estimate.state is not State.TRACKING or not estimate.pose or not estimate.points:
+            self._asked, self._mute = self._asked + 1, self._mute + 1
+        else:
             points = estimate.points[estimate.points.label >= 0]
             frame = FrameObservation(
                 estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8))
@@ -130,94 +177,98 @@ class CalibrationMonitor:
 
     def add_frame(self, frame: FrameObservation, pose: Pose2) -> None:
         """Look at measurements of one frame and the pose that they gave."""
+        self._asked += 1
         if len(frame.lines) < _LEAST_LINES:
             return
         observations = Observations.stack(
             [frame.thinned(self.options.points_per_line)], self._parameters.rough.line_map)
         problem = Problem(self._parameters, observations, check=False)
-        terms = problem.linearise(np.zeros(len(self._parameters)), pose.as_array()[None])
+        here = pose.as_array()
+        terms = problem.linearise(np.zeros(len(self._parameters)), here[None])
         if terms.hit.sum() < 12:
             return
         scale = max(1.0, 1.4826 * float(np.median(np.abs(terms.residual[terms.hit]))))
         weight = terms.hit / (1.0 + (terms.residual / (_CAUCHY * scale)) ** 2)
         system = ArrowSystem.of(terms, weight, problem.slices)
         information, slope, gain = system.reduced()
-        keep = 1.0 - 1.0 / self.options.memory
-        self._information = keep * self._information + information
-        self._scatter = keep * self._scatter + np.outer(slope, slope)
-        self._slope = keep * self._slope + slope
-        self._weight = keep * self._weight + 1.0
-        self._frames += 1
-        self._gains.append((gain[0], pose.as_array()))
+        if self._places and self._places[-1].holds(here):
+            self._places[-1].average(information, slope, gain[0])
+        else:
+            self._places.append(_Place(here, information, slope, gain[0]))
 
     def verdict(self) -> Verdict:
         """What the frames so far say."""
-        if self._frames < self.options.least_frames:
+        places = len(self._places)
+        if places < self.options.least_frames:
             return Verdict(
-                Condition.UNKNOWN, f'calibration not judged yet: {self._frames} of '
-                f'{self.options.least_frames} frames', self._frames, 0.0, float('inf'), 0.0)
-        statistic, limit = self._regularity()
-        step = self._step(np.ones(len(self._parameters), dtype=bool))
+                Condition.UNKNOWN, f'calibration not judged yet: frames from {places} of '
+                f'{self.options.least_frames} places; {self._mute} of {self._asked} images gave '
+                'no pose to judge it by', places, 0.0, float('inf'), 0.0)
+        slopes = np.array([place.slope for place in self._places])
+        curvatures = np.array([place.information for place in self._places])
+        statistic, limit = self._regularity(slopes, curvatures)
+        pull, information = slopes.sum(axis=0), curvatures.sum(axis=0)
+        step = self._step(np.ones(len(self._parameters), dtype=bool), pull, information)
         error = self._pose_error(step)
-        if statistic <= limit or error <= self.options.pose_error:
+        if statistic <= limit:
+            words = f'calibration good: residuals from {places} places are noise'
+        elif error <= self.options.pose_error:
+            words = (f'calibration good: residuals from {places} places ask for pose changes of '
+                     f'{1e3 * error:.1f} mm')
+        else:
             return Verdict(
-                Condition.GOOD, f'calibration good: residuals over {self._frames} frames ask for '
-                f'pose changes of {1e3 * error:.1f} mm', self._frames, statistic, limit, error)
-        return Verdict(
-            Condition.SUSPECT, f'{self._suspicion()}; poses are off by up to about '
-            f'{_significant(1e3 * error)} mm: calibrate again', self._frames, statistic, limit,
-            error)
+                Condition.SUSPECT, f'{self._suspicion(pull, information)}; poses are off by up to '
+                f'about {_significant(1e3 * error)} mm: calibrate again', places, statistic,
+                limit, error)
+        return Verdict(Condition.GOOD, words, places, statistic, limit, error)
 
-    def _regularity(self) -> tuple[float, float]:
-        """The summed pull against what independent pulls of that size would sum to."""
+    def _regularity(self, slopes: Array, curvatures: Array) -> tuple[float, float]:
+        """The summed pull against chance, for slopes (K, P) and curvatures (K, P, P)."""
         spread = self._parameters.spread
-        scaled = self._information * np.outer(spread, spread)
-        values, vectors = np.linalg.eigh(scaled)
-        seen = vectors[:, values > 1.0]
-        if not seen.shape[1]:
+        values, vectors = np.linalg.eigh(curvatures.sum(axis=0) * np.outer(spread, spread))
+        seen = values > 1.0
+        freedom, places = int(seen.sum()), len(slopes)
+        if not freedom:
             return 0.0, float('inf')
-        pull = seen.T @ (spread * self._slope)
-        # Noise as told, or as large as the pulls themselves show it to be.
-        told = np.diag(values[values > 1.0])
-        shown = seen.T @ (self._scatter * np.outer(spread, spread)) @ seen
-        mean = np.outer(pull, pull) / self._weight
-        covariance = np.maximum(1.0, _ratio(shown - mean, told)) * told
-        freedom = seen.shape[1]
-        return (float(pull @ np.linalg.solve(covariance, pull)),
-                float(chi2.isf(self.options.false_alarm, freedom)))
+        # In units in which the noise that was told makes every part of the sum 1.
+        units = spread[:, None] * vectors[:, seen] / np.sqrt(values[seen])
+        pulls = slopes @ units
+        shares = np.einsum('pi,kpq,qj->kij', units, curvatures, units)
+        total = pulls.sum(axis=0)
+        left = pulls - shares @ total
+        # What noise as told would leave; a place that alone fixes something leaves less.
+        expected = freedom - float(np.sum(shares**2))
+        chance = max(1.0, float(np.sum(left**2)) / max(expected, 1e-3 * freedom))
+        # One degree of freedom a place for the size of chance, however many parts each has.
+        limit = freedom * float(f.isf(self.options.false_alarm, freedom, places - 1))
+        return float(total @ total) / chance, limit
 
-    def _step(self, free: Array) -> Array:
+    def _step(self, free: Array, pull: Array, information: Array) -> Array:
         """What change of the free numbers (P,) of the rig the pulls ask for, (P,)."""
         spread = self._parameters.spread[free]
-        information = self._information[np.ix_(free, free)]
         step = np.zeros(len(self._parameters))
-        scaled = information * np.outer(spread, spread) + np.eye(len(spread))
-        step[free] = -spread * np.linalg.solve(scaled, spread * self._slope[free])
+        scaled = information[np.ix_(free, free)] * np.outer(spread, spread) + np.eye(len(spread))
+        step[free] = -spread * np.linalg.solve(scaled, spread * pull[free])
         return step
 
     def _pose_error(self, step: Array) -> float:
-        gains = np.array([gain for gain, _ in self._gains])
-        poses = np.array([pose for _, pose in self._gains])
+        gains = np.array([place.gain for place in self._places])
+        poses = np.array([place.pose for place in self._places])
         moved = pose_uncertainty(gains, poses, np.outer(step, step))
         return float(np.hypot(moved.position, moved.base_position))
 
-    def _suspicion(self) -> str:
+    def _suspicion(self, pull: Array, information: Array) -> str:
         """The single part whose move explains the pulls best, and by how much it moved."""
         groups = {p.group for p in self._parameters.parameters}
         best, words = -1.0, ''
         for group in sorted(groups):
             free = np.array([p.group == group for p in self._parameters.parameters])
-            step = self._step(free)
-            explained = -float(self._slope @ step)
+            step = self._step(free, pull, information)
+            explained = -float(pull @ step)
             if explained > best:
                 size = float(np.linalg.norm(step))
                 best, words = explained, _MOVES[group](size)
         return f'residuals suggest {words}'
-
-
-def _ratio(shown: Array, told: Array) -> float:
-    """How much larger one covariance is than another, on average over directions."""
-    return float(np.trace(np.linalg.solve(told, shown))) / len(told)
 
 
 def _significant(value: float) -> str:

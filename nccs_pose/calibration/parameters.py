@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.sensitivity import Sensitivity
@@ -37,6 +38,7 @@ from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import Array, RigidTransform, rotation_exp
 from nccs_pose.geometry.rig import Rig
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class RigParameters:
         return LineMap(tuple(lines), self.rough.line_map.frame)
 
     def columns(self, theta: Array, sensitivity: Sensitivity, model: RigModel,
-                pixels: Array, line: Array) -> Array:
+                pixels: Array, line: NDArray[np.intp]) -> Array:
         """dS/dtheta (N, P), exact at theta.
 
         :param model: the rig and map at theta.
@@ -177,8 +179,8 @@ class RigParameters:
         }
         for i in self.lines:
             on = line == i
-            source[f'line{i}_offset'] = lambda on=on: s.line_offset * on
-            source[f'line{i}_turn'] = lambda on=on: s.line_turn * on
+            source[f'line{i}_offset'] = partial(np.multiply, s.line_offset, on)
+            source[f'line{i}_turn'] = partial(np.multiply, s.line_turn, on)
         return np.stack([source[p.name]() for p in self.parameters], axis=1)
 
 

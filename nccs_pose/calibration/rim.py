@@ -24,18 +24,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
 import numpy as np
-from numpy.typing import NDArray
 
-_RAYS = 240  # directions in which the outline is looked for
-_REACH = 0.3  # of the expected radius, how far off it may be
-_TRIALS = 400
-_CLOSE = 2.0  # px
-_LEAST = 0.35  # fraction of the directions that must agree on one outline
+_POINTS = 240  # of an outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +105,7 @@ def rig_from_outline(rig: Rig, pixels: Array) -> Rig:
     return min(possible, key=lambda r: _turn(r.R_mirror_camera @ rig.R_mirror_camera.T))
 
 
-def rim_points(rig: Rig, count: int = _RAYS) -> Array:
+def rim_points(rig: Rig, count: int = _POINTS) -> Array:
     """Points (N, 3) of the rim in the mirror frame."""
     rim, mirror = rig.mirror.rim_radius, rig.mirror
     if rim is None:
@@ -128,7 +122,7 @@ def rim_is_seen(rig: Rig) -> bool:
     return bool((facing > 0.0).mean() > 0.8)
 
 
-def outline_points(rig: Rig, count: int = _RAYS) -> Array:
+def outline_points(rig: Rig, count: int = _POINTS) -> Array:
     """Pixels (N, 2) of the outline: the rim, or a sphere's occluding contour."""
     if rim_is_seen(rig):
         points = rim_points(rig, count)
@@ -201,83 +195,3 @@ def _perpendicular(vector: Array, axis: Array) -> Array:
 def _turn(rotation: Array) -> float:
     """Angle of a rotation, radians."""
     return float(np.arccos(np.clip(0.5 * (np.trace(rotation) - 1.0), -1.0, 1.0)))
-
-
-def find_outline(rig: Rig, images: list[NDArray[np.uint8]]) -> Array:
-    """Pixels (N, 2) of the mirror's outline in images (H, W, 3) of one drive.
-
-    What moves through the images blurs in their mean; the outline stays. It is looked for from
-    the expected centre outwards, where the rough rig expects it within 30 % of its radius.
-
-    :raises CalibrationError: if no ellipse stands out.
-    """
-    expected = outline_points(rig)
-    centre = expected.mean(axis=0)
-    steepness = np.mean([_gradient(image) for image in images], axis=0)
-    angle = np.linspace(0.0, 2.0 * np.pi, _RAYS, endpoint=False)
-    out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    radius = _radius_at(expected - centre, angle)
-    reach = np.arange(np.floor((1.0 - _REACH) * radius.min()), (1.0 + _REACH) * radius.max())
-    at = centre + reach[:, None, None] * out
-    inside = np.abs(reach[:, None] - radius) <= _REACH * radius
-    profile = cv2.remap(
-        steepness.astype(np.float32), at.astype(np.float32), None, cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT) * inside
-    best = profile.argmax(axis=0)
-    strong = profile[best, np.arange(_RAYS)] > 4.0 * np.median(steepness) + 1e-6
-    points = at[best, np.arange(_RAYS)][strong]
-    agreed = _consensus(points)
-    if agreed.sum() < _LEAST * _RAYS:
-        raise CalibrationError(
-            f"the mirror's outline was not found: {int(agreed.sum())} of {_RAYS} directions agree "
-            'on an ellipse')
-    return points[agreed]
-
-
-def _gradient(image: NDArray[np.uint8]) -> Array:
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (0, 0), 1.5)
-    return np.hypot(
-        cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)).astype(float)
-
-
-def _radius_at(points: Array, angle: Array) -> Array:
-    """Distance of a closed curve (N, 2) about the origin at angles (K,)."""
-    own = np.arctan2(points[:, 1], points[:, 0])
-    order = np.argsort(own)
-    return np.interp(
-        angle, own[order], np.linalg.norm(points, axis=1)[order], period=2.0 * np.pi)
-
-
-def _consensus(points: Array) -> NDArray[np.bool_]:
-    """Which points (N, 2) lie on the one ellipse that most of them share."""
-    best = np.zeros(len(points), dtype=bool)
-    if len(points) < 8:
-        return best
-    rng = np.random.default_rng(0)
-    middle, size = points.mean(axis=0), float(points.std())
-    plane = (points - middle) / size
-    for _ in range(_TRIALS):
-        conic = _conic(plane[rng.choice(len(points), 5, replace=False)])
-        near = _conic_distance(conic, plane) * size < _CLOSE
-        if near.sum() > best.sum():
-            best = near
-    if best.sum() >= 6:
-        best = _conic_distance(_conic(plane[best]), plane) * size < _CLOSE
-    return best
-
-
-def _conic(plane: Array) -> Array:
-    x, y = plane.T
-    rows = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], axis=1)
-    return np.linalg.svd(rows)[2][-1]
-
-
-def _conic_distance(conic: Array, plane: Array) -> Array:
-    """Sampson distance (N,); infinite unless the conic is an ellipse."""
-    a, b, c, d, e, f = conic
-    if 4.0 * a * c <= b * b:
-        return np.full(len(plane), np.inf)
-    x, y = plane.T
-    value = a * x * x + b * x * y + c * y * y + d * x + e * y + f
-    return np.abs(value) / np.maximum(
-        np.hypot(2.0 * a * x + b * y + d, b * x + 2.0 * c * y + e), 1e-12)

@@ -23,8 +23,9 @@ import sys
 
 from nccs_pose.calibration.from_images import calibrate_images
 from nccs_pose.calibration.options import CalibrationOptions
+from nccs_pose.calibration.outline import find_outline
 from nccs_pose.calibration.procedure import Calibration
-from nccs_pose.calibration.rim import find_outline, rig_from_outline
+from nccs_pose.calibration.rim import rig_from_outline
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import OptionError
 from nccs_pose.files.pictures import save_figure
@@ -91,16 +92,16 @@ def _options(args: argparse.Namespace) -> CalibrationOptions:
     """
     values: dict[str, bool | int | float] = {_FREE[name]: True for name in args.free}
     values |= dict.fromkeys(args.hold, False)
-    known = {f.name: f.default for f in dataclasses.fields(CalibrationOptions)}
     for setting in args.option:
         name, found, text = setting.partition('=')
-        if not found or name not in known or isinstance(known[name], bool):
+        default = getattr(CalibrationOptions, name, None)
+        if not found or isinstance(default, bool) or not isinstance(default, (int, float)):
             raise OptionError(f'--option {setting}: expected NAME=VALUE with a known NAME')
+        kind = type(default)
         try:
-            values[name] = type(known[name])(text)
+            values[name] = kind(text)
         except ValueError:
-            raise OptionError(
-                f'--option {setting}: {text!r} is no {type(known[name]).__name__}') from None
+            raise OptionError(f'--option {setting}: {text!r} is no {kind.__name__}') from None
     return dataclasses.replace(CalibrationOptions(), **values)  # type: ignore[arg-type]
 
 

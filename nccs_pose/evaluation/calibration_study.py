@@ -76,6 +76,14 @@ def _vector(rng: Random, size: int, length: float) -> Array:
     return length * vector / np.linalg.norm(vector)
 
 
+def off_in_each(rig: Rig, rng: Random, cop: float = 3e-4, tilt: float = np.deg2rad(0.3)) -> Rig:
+    """The rig with each number of the camera's place (m) and turn (rad) off, up or down."""
+    signs = rng.choice([-1.0, 1.0], 5)
+    return replace(
+        rig, cop=rig.cop + cop * np.array([0.0, *signs[:2]]),
+        R_mirror_camera=rotation_exp(tilt * signs[2:]) @ rig.R_mirror_camera)
+
+
 def disturbed(
     rig: Rig, rng: Random, *, cop: float = 3e-4, tilt: float = np.deg2rad(0.3),
     height: float = 0.0, rig_tilt: float = 0.0,
@@ -164,33 +172,36 @@ def squared_errors(
 
 
 def targets(kinds: Sequence[str], rigs: int) -> None:
-    """20 frames x 4 lines x 75 px at 0.2 px, starting 0.3 mm and 0.3 degrees off."""
+    """20 frames x 4 lines x 75 px at 0.2 px, each number 0.3 mm or 0.3 degrees off at first."""
     line_map = arena_map()
     for kind in kinds:
         before, after, cop, seconds, total, freedom = [], [], [], [], 0.0, 0
         for seed in range(rigs):
             rng = np.random.default_rng(seed)
             true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
-            rough = disturbed(true, rng)
+            rough = off_in_each(true, rng)
             frames, _ = measured_frames(true, line_map, 25, rng)
-            start = time.perf_counter()
+            start = time.process_time()
             found = calibrate(rough, line_map, frames)
-            seconds.append(time.perf_counter() - start)
+            seconds.append(time.process_time() - start)
             rig, result = found.model.rig, found.adjustment
-            before.append(pose_bias(rough, true, line_map, rng).position)
-            after.append(pose_bias(rig, true, line_map, rng).position)
-            cop.append(rig.cop[1:] - true.cop[1:])
+            before.append(1e3 * pose_bias(rough, true, line_map, rng).position)
+            after.append(1e3 * pose_bias(rig, true, line_map, rng).position)
+            cop.append(1e6 * (rig.cop[1:] - true.cop[1:]))
             one, k = squared_errors(
                 result.theta, deviation_of(true, found.parameters), result.information,
                 found.parameters.spread)
             total, freedom = total + one, freedom + k
         low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
-        print(f'{kind}: {rigs} rigs; pose bias, median (worst) '
-              f'{1e3 * np.median(before):.0f} ({1e3 * max(before):.0f}) -> '
-              f'{1e3 * np.median(after):.3f} ({1e3 * max(after):.3f}) mm; COP rms '
-              f'{1e6 * np.sqrt(np.mean(np.square(cop), axis=0)).round(7)} um; chi2 per degree '
-              f'{total / freedom:.3f} (95 % band {low:.3f} to {high:.3f}); '
-              f'{np.median(seconds):.2f} s, worst {max(seconds):.2f} s')
+        far = np.array(before) > 100.0
+        rms = np.sqrt(np.mean(np.square(cop), axis=0))
+        print(f'{kind}: {rigs} rigs; pose bias, median (worst) {np.median(before):.0f} '
+              f'({max(before):.0f}) -> {np.median(after):.3f} ({max(after):.3f}) mm; of the '
+              f'{far.sum()} that begin above 100 mm the worst ends at '
+              f'{max(np.array(after)[far], default=0.0):.3f} mm; COP rms {rms[0]:.1f} and '
+              f'{rms[1]:.1f} um; chi2 per degree {total / freedom:.3f} of {freedom} (95 % band '
+              f'{low:.3f} to {high:.3f}); CPU {np.median(seconds):.2f} s, worst '
+              f'{max(seconds):.2f} s', flush=True)
 
 
 def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
@@ -209,14 +220,14 @@ def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
                 frames, _ = measured_frames(true, line_map, 25, rng)
             except GeometryError:
                 continue
-            start = time.perf_counter()
+            start = time.process_time()
             try:
                 found = calibrate(rough, line_map, frames)
             except CalibrationError as error:
                 said += 1
                 print(f'  {kind} {seed}: {error}')
                 continue
-            seconds.append(time.perf_counter() - start)
+            seconds.append(time.process_time() - start)
             bias = pose_bias(found.model.rig, true, line_map, rng)
             if bias.position < 5e-3:
                 good += 1
@@ -226,21 +237,21 @@ def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
                 wrong += 1
                 print(f'  {kind} {seed}: wrong, {bias}, {found.verdict}')
         print(f'{kind}: {good} of {good + said + wrong} found, {said} refused in words, '
-              f'{wrong} wrong and not noticed; {np.median(seconds):.1f} s, worst '
-              f'{max(seconds):.1f} s')
+              f'{wrong} wrong and not noticed; CPU {np.median(seconds):.1f} s, worst '
+              f'{max(seconds):.1f} s', flush=True)
 
 
 def cost() -> None:
-    """Time of the adjustment alone."""
+    """CPU time of the adjustment alone."""
     line_map, true = arena_map(), arena_rig()
     for count in (20, 80, 320):
         rng = np.random.default_rng(0)
         frames, poses = measured_frames(true, line_map, count, rng)
         parameters = RigParameters(disturbed(true, rng), line_map)
         observations = Observations.stack(frames, line_map)
-        start = time.perf_counter()
+        start = time.process_time()
         result = adjust(parameters, observations, poses)
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         print(f'{count} frames, {len(observations)} points: {seconds:.2f} s, '
               f'{result.iterations} steps, {1e3 * seconds / result.iterations / count:.3f} ms '
               'per step and frame')
