@@ -39,6 +39,7 @@ restriction.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 import math
 
 from nccs_pose.errors import EstimationError
@@ -174,33 +175,41 @@ class PaperProblem:
             squares = (self.p_rows**2).sum(axis=1) + np.abs(w) * (self.q_rows**2).sum(axis=1)
             self.E = 1.0 / np.sqrt(np.maximum(squares, 1e-300))
 
-    def _p_and_q(self, parameters: Array) -> tuple[Array, Array, Array, Array]:
-        """P and Q (M,), and their gradients (M, 4)."""
-        c, s, t_x, t_y = parameters
-        monomials = np.array([c * c, s * s, c * t_x, s * t_x, c * t_y, s * t_y, c, s, t_x])
+        self.dq = np.stack(
+            [self.q_rows[:, 0], self.q_rows[:, 1], zero, self.q_rows[:, 2]], axis=1)
+        # SLSQP asks for values, gradients and constraints one by one: each place is computed once
+        self._p_and_q = lru_cache(maxsize=1)(self._p_and_q_at)
+        self._g2 = lru_cache(maxsize=1)(self._g2_at)
+
+    def _p_and_q_at(
+        self, c: float, s: float, t_x: float, t_y: float,
+    ) -> tuple[Array, Array, Array]:
+        """P and Q (M,), and the gradient of P (M, 4)."""
         slopes = np.array([
             [2 * c, 0, 0, 0], [0, 2 * s, 0, 0], [t_x, 0, c, 0], [0, t_x, s, 0],
             [t_y, 0, 0, c], [0, t_y, 0, s], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
-        p, q = self.p_rows @ monomials, self.q_rows @ np.array([c, s, t_y, 1.0])
-        dq = np.stack(
-            [self.q_rows[:, 0], self.q_rows[:, 1], np.zeros(len(q)), self.q_rows[:, 2]], axis=1)
-        return p, q, self.p_rows @ slopes, dq
+        p = self.p_rows @ (c * c, s * s, c * t_x, s * t_x, c * t_y, s * t_y, c, s, t_x)
+        return p, self.q_rows @ (c, s, t_y, 1.0), self.p_rows @ slopes
 
     def gamma_r(self, parameters: Array) -> tuple[Array, Array]:
         """gamma_r (M,) (eq. 19) and its gradient by (c, s, t_x, t_y) (M, 4)."""
-        p, q, dp, dq = self._p_and_q(parameters)
+        p, q, dp = self._p_and_q(*parameters.tolist())
         square = self.E**2
         gamma = square * (p * p + self.W * q * q)
-        return gamma, 2.0 * square[:, None] * (p[:, None] * dp + (self.W * q)[:, None] * dq)
+        return gamma, 2.0 * square[:, None] * (p[:, None] * dp + (self.W * q)[:, None] * self.dq)
 
     def g2(self, parameters: Array) -> tuple[float, Array]:
         """Mean (x - P / Q)^2 (eq. 20) in square metres and its gradient (4,)."""
-        p, q, dp, dq = self._p_and_q(parameters)
+        return self._g2(*parameters.tolist())
+
+    def _g2_at(self, c: float, s: float, t_x: float, t_y: float) -> tuple[float, Array]:
+        p, q, dp = self._p_and_q(c, s, t_x, t_y)
         # a pole of x: kept finite, as far away as it likes
         q = np.where(np.abs(q) > 1e-30, q, 1e-30)
-        off = self.x - p / q
-        slope = -(dp - (p / q)[:, None] * dq) / q[:, None]
-        return float(off @ off) / len(off), 2.0 * (off @ slope) / len(off)
+        x = p / q
+        off = self.x - x
+        slope = (off * x / q) @ self.dq - (off / q) @ dp
+        return float(off @ off) / len(off), 2.0 * slope / len(off)
 
 
 def paper_estimate(
@@ -251,14 +260,16 @@ def _solve(
     scale = scale if scale > 0.0 else 1.0
 
     # in units of the start's own violation, as the objective
-    unit = max(problem.g2(first)[0], 1e-30) if use_g2 else math.inf
+    unit = max(problem.g2(first)[0], 1e-30)
     best, best_merit = first, math.inf
 
     def objective(parameters: Array) -> tuple[float, Array]:
         nonlocal best, best_merit
         gamma, slope = problem.gamma_r(parameters)
         value = float(np.abs(gamma).mean()) / scale
-        merit = value + abs(_g1(parameters)) + problem.g2(parameters)[0] / unit
+        merit = value + abs(_g1(parameters))
+        if use_g2:
+            merit += problem.g2(parameters)[0] / unit
         if merit < best_merit:
             best, best_merit = parameters.copy(), merit
         return value, np.sign(gamma) @ slope / (len(gamma) * scale)

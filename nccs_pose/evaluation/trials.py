@@ -193,48 +193,64 @@ def make_data_set(
     start = Pose2(
         truth.x + reach * distance * math.cos(angle), truth.y + reach * distance * math.sin(angle),
         truth.yaw + math.radians(turn) * rng.uniform(-1.0, 1.0))
-    points, directions = [], []
-    for _ in range(_TRIES * cell.lines):
-        found = _points_of_a_line(rig, options, cell, rng)
-        if found is not None:
-            points.append(found[0])
-            directions.append(found[1])
-        if len(points) == cell.lines:
-            break
-    else:
-        raise SimulationError(
-            f'mirror {cell.mirror!r} sees hardly any line with {cell.points} points between '
-            f'nearest = {options.nearest} m and farthest = {options.farthest} m')
-    in_base = np.concatenate(points)
+    in_base, clean, directions = _random_lines(rig, options, cell, rng)
     label = np.repeat(np.arange(cell.lines), cell.points)
-    d = np.array(directions) @ truth.rotation.T
-    mu = np.cross(truth.apply(np.array([p[0] for p in points])), d)
-    clean, _ = rig.project(in_base)
-    moved = in_base + rng.normal(size=in_base.shape) * cell.sigma_world
-    pixels, seen = rig.project(moved)
+    d = directions @ truth.rotation.T
+    mu = np.cross(truth.apply(in_base[::cell.points]), d)
+    pixels, seen = clean, np.ones(len(clean), dtype=bool)
+    if cell.sigma_world > 0.0:
+        pixels, seen = rig.project(
+            in_base + rng.normal(size=in_base.shape) * cell.sigma_world)
     pixels = pixels + rng.normal(size=pixels.shape) * cell.sigma_px
     # a noisy pixel beside the mirror, or a point that noise hides, is no measurement
     seen &= rig.mirror_points(pixels)[1]
     return DataSet(pixels[seen], clean[seen], d, mu, label[seen], truth, start)
 
 
-def _points_of_a_line(
+def _random_lines(
     rig: Rig, options: ExperimentOptions, cell: Cell, rng: np.random.Generator,
-) -> tuple[Array, Array] | None:
-    """Points (K, 3) of a random line, all seen, and its direction (3,), in base_link."""
+) -> tuple[Array, Array, Array]:
+    """Random lines of which the camera sees enough points.
+
+    :returns: points (L K, 3), line by line, and their pixels (L K, 2); directions (L, 3). All in
+        base_link.
+    """
+    points: list[Array] = []
+    pixels: list[Array] = []
+    directions: list[Array] = []
+    count, tries = 4 * cell.points + 20, 0
+    while len(directions) < cell.lines:
+        if tries > _TRIES * cell.lines:
+            raise SimulationError(
+                f'mirror {cell.mirror!r} sees hardly any line with {cell.points} points between '
+                f'nearest = {options.nearest} m and farthest = {options.farthest} m')
+        # all at once, and a few more than are missing: projecting is cheap in bulk
+        batch = 2 * (cell.lines - len(directions)) + 2
+        tries += batch
+        q, d = _lines(rig, options, cell.on_floor, batch, rng)
+        along = options.length * rng.uniform(-0.5, 0.5, (batch, count, 1))
+        places = q[:, None] + along * d[:, None]
+        distance = np.linalg.norm(places - rig.T_base_mirror.translation, axis=2)
+        near = (distance >= options.nearest) & (distance <= options.farthest)
+        image, usable = np.zeros((batch, count, 2)), np.zeros((batch, count), dtype=bool)
+        image[near], usable[near] = rig.project(places[near])
+        for i in np.flatnonzero(usable.sum(axis=1) >= cell.points)[:cell.lines - len(points)]:
+            chosen = np.flatnonzero(usable[i])[:cell.points]
+            points.append(places[i, chosen])
+            pixels.append(image[i, chosen])
+            directions.append(d[i])
+    return np.concatenate(points), np.concatenate(pixels), np.array(directions)
+
+
+def _lines(
+    rig: Rig, options: ExperimentOptions, on_floor: bool, count: int, rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Points (N, 3) that lines go through, and unit directions (N, 3), in base_link."""
     mirror = rig.T_base_mirror.translation
-    q, d = rng.normal(size=(2, 3))
-    if cell.on_floor:
-        q[2] = d[2] = 0.0
-        below = np.array([mirror[0], mirror[1], 0.0])
-        q = below + q * rng.uniform(options.nearest, options.farthest) / np.linalg.norm(q)
-    else:
-        q = mirror + q * rng.uniform(options.nearest, options.farthest) / np.linalg.norm(q)
-    d /= np.linalg.norm(d)
-    along = options.length * rng.uniform(-0.5, 0.5, 4 * cell.points + 20)
-    points = q + along[:, None] * d
-    distance = np.linalg.norm(points - mirror, axis=1)
-    points = points[(distance >= options.nearest) & (distance <= options.farthest)]
-    _, seen = rig.project(points)
-    points = points[seen]
-    return None if len(points) < cell.points else (points[:cell.points], d)
+    q, d = rng.normal(size=(2, count, 3))
+    if on_floor:
+        q[:, 2] = d[:, 2] = 0.0
+    distance = rng.uniform(options.nearest, options.farthest, (count, 1))
+    centre = np.array([mirror[0], mirror[1], 0.0]) if on_floor else mirror
+    q = centre + q * distance / np.linalg.norm(q, axis=1, keepdims=True)
+    return q, d / np.linalg.norm(d, axis=1, keepdims=True)
