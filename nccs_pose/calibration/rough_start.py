@@ -161,4 +161,4 @@ def _moved(before: Array, after: Array) -> NDArray[np.bool_]:
     """Which poses (F, 3) changed by more than a few centimetres or degrees."""
     change = after - before
     change[:, 2] = wrap_angle(change[:, 2])
-    return np.asarray((np.abs(change) >= 0.03).any(axis=1))
+    return np.asarray(~(np.abs(change) < 0.03).all(axis=1))  # a pose that is new has moved
