@@ -62,11 +62,21 @@ def test_the_outline_of_a_sphere_gives_its_place_before_the_camera():
     rig = rimmed('arena', 0.032)
     rough = disturbed(rig, np.random.default_rng(1), cop=3e-3, tilt=np.deg2rad(2.0))
     found = rig_from_outline(rough, outline_points(rig))
-    # The turn about the centre is the rough rig's; the centre in the camera's frame is not.
+    # The turn about the centre is nearly the rough rig's; the centre, seen from the camera, is
+    # the true one.
     np.testing.assert_allclose(
         found.R_mirror_camera.T @ found.cop, rig.R_mirror_camera.T @ rig.cop, atol=1e-9)
     with pytest.raises(CalibrationError, match='no rim_radius'):
         rig_from_outline(RIGS['parabolic'], outline_points(rig))
+
+
+def test_an_outline_of_something_else_is_refused():
+    for name, radius in (('arena', 0.032), ('parabolic', 0.005)):
+        rig = rimmed(name, radius)
+        outline = outline_points(rig)
+        middle = outline.mean(axis=0)
+        with pytest.raises(CalibrationError, match="puts the mirror .* not the mirror's outline"):
+            rig_from_outline(rig, middle + 0.7 * (outline - middle))
 
 
 def rim_disc(rig, pixels):

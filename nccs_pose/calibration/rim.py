@@ -24,12 +24,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.errors import CalibrationError, GeometryError
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, rotation_exp
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 
 _POINTS = 240  # of an outline
+_SPREADS = 3.0  # how many standard deviations off the rough rig may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +78,18 @@ def circle_poses(directions: Array, radius: float) -> tuple[Circle, Circle]:
     return found[0], found[1]
 
 
-def rig_from_outline(rig: Rig, pixels: Array) -> Rig:
+def rig_from_outline(
+    rig: Rig, pixels: Array, options: CalibrationOptions | None = None,
+) -> Rig:
     """The rough rig with its camera placed by pixels (N, 2) on the mirror's outline.
 
     Of two possible rigs, the one whose camera looks more like the rough one's.
 
+    :param options: how rough the rig is.
     :raises CalibrationError: if the rim's radius is not known, or the outline is not the rim
-        and the mirror no sphere, or no such rig can be.
+        and the mirror no sphere, or no such rig can be, or it is too far from the rough one.
     """
+    options = options or CalibrationOptions()
     if rig.mirror.rim_radius is None:
         raise CalibrationError('the mirror has no rim_radius: the image cannot tell its distance')
     if len(pixels) < 6:
@@ -102,7 +108,23 @@ def rig_from_outline(rig: Rig, pixels: Array) -> Rig:
             'of the rim')
     if not possible:
         raise CalibrationError("the mirror's outline puts the camera where it cannot be")
-    return min(possible, key=lambda r: _turn(r.R_mirror_camera @ rig.R_mirror_camera.T))
+    found_rig = min(possible, key=lambda r: _turn(r.R_mirror_camera @ rig.R_mirror_camera.T))
+    _demand_near(found_rig, rig, options)
+    return found_rig
+
+
+def _demand_near(found: Rig, rough: Rig, options: CalibrationOptions) -> None:
+    """Refuse a rig whose mirror stands, seen from the camera, where the rough one cannot."""
+    apex = np.array([0.0, 0.0, rough.mirror.apex_z])
+    there, here = (r.R_mirror_camera.T @ (apex - r.cop) for r in (found, rough))
+    off = float(np.linalg.norm(there - here))
+    most = _SPREADS * float(np.hypot(
+        options.rough_cop, np.linalg.norm(here) * options.rough_camera_tilt))
+    if off > most:
+        raise CalibrationError(
+            f"the ellipse that was found puts the mirror {1e3 * off:.1f} mm from where the rough "
+            f"rig has it (allowed: {1e3 * most:.1f} mm); it is not the mirror's outline, or the "
+            'rough rig or rim_radius is wrong')
 
 
 def rim_points(rig: Rig, count: int = _POINTS) -> Array:
@@ -168,15 +190,16 @@ def _placed_sphere(rig: Rig, directions: Array) -> Rig | None:
         return None
     squared = rig.mirror.C + 0.25 * rig.mirror.B**2
     distance = np.sqrt(squared / (1.0 - cosine**2))
-    centre = distance * cosine * scaled
-    cop = np.array([0.0, 0.0, -0.5 * rig.mirror.B]) - rig.R_mirror_camera @ centre
-    side = -1.0 if rig.cop[1] < 0.0 else 1.0
-    angle = np.arctan2(side * cop[0], side * cop[1])
-    turn = np.array([
-        [np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0],
-        [0.0, 0.0, 1.0]])
-    cop = turn @ cop
-    cop[0] = 0.0
+    to_camera = -rig.R_mirror_camera @ (distance * cosine * scaled)
+    # The camera's direction is the rough one's; so that it stays at x = 0, turn it about the
+    # sphere's centre by as little as will do.
+    in_plane = to_camera * [0.0, 1.0, 1.0]
+    axis = np.cross(to_camera, in_plane)
+    sine = float(np.linalg.norm(axis)) / float(
+        np.linalg.norm(to_camera) * np.linalg.norm(in_plane))
+    turn = rotation_exp(axis * (np.arcsin(sine) / max(float(np.linalg.norm(axis)), 1e-30)))
+    cop = turn @ to_camera - np.array([0.0, 0.0, 0.5 * rig.mirror.B])
+    cop[0] = 0.0  # but for rounding
     return _built(rig, cop, turn @ rig.R_mirror_camera)
 
 

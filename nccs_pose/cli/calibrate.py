@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     images = DriveImages(args.bag, max(1, args.images), args.image_topic)
     images.check_size(rig.camera)
     if args.from_rim:
-        rig = _from_rim(rig, images)
+        rig = _from_rim(rig, images, options)
     result = calibrate_images(
         rig, line_map, images, options, args.free_line,
         on_pass=lambda words: print(words, file=sys.stderr, flush=True))
@@ -105,13 +105,13 @@ def _options(args: argparse.Namespace) -> CalibrationOptions:
     return dataclasses.replace(CalibrationOptions(), **values)  # type: ignore[arg-type]
 
 
-def _from_rim(rig: Rig, images: DriveImages) -> Rig:
+def _from_rim(rig: Rig, images: DriveImages, options: CalibrationOptions) -> Rig:
     some = []
     for _, image in images():
         some.append(image)
         if len(some) == _OUTLINE_IMAGES:
             break
-    return rig_from_outline(rig, find_outline(rig, some))
+    return rig_from_outline(rig, find_outline(rig, some, options), options)
 
 
 def _write(args: argparse.Namespace, result: Calibration) -> None:
