@@ -51,7 +51,7 @@ from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.options import check_options, option
 import numpy as np
-from scipy.stats import f
+from scipy.special import fdtri
 
 _CAUCHY = 2.385
 _LEAST_LINES = 2
@@ -240,7 +240,7 @@ class CalibrationMonitor:
         expected = freedom - float(np.sum(shares**2))
         chance = max(1.0, float(np.sum(left**2)) / max(expected, 1e-3 * freedom))
         # One degree of freedom a place for the size of chance, however many parts each has.
-        limit = freedom * float(f.isf(self.options.false_alarm, freedom, places - 1))
+        limit = freedom * float(fdtri(freedom, places - 1, 1.0 - self.options.false_alarm))
         return float(total @ total) / chance, limit
 
     def _step(self, free: Array, pull: Array, information: Array) -> Array:
