@@ -45,7 +45,7 @@ setup(
     entry_points={
         'console_scripts': [
             'demo = nccs_pose.ros.demo:main',
-            'localiser = nccs_pose.ros.localiser_node:main',
+            'localiser = nccs_pose.ros.localiser:main',
             'nccs-pose = nccs_pose.cli:main',
             'play = nccs_pose.ros.player:main',
             'stand_in_camera = nccs_pose.ros.stand_in_camera:main',

@@ -75,7 +75,7 @@ def image_message(stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Ima
     message.header.frame_id = frame_id
     # array.array is the one type that rclpy takes without looking at every byte.
     pixels = array.array('B')
-    pixels.frombytes(memoryview(np.ascontiguousarray(image)).cast('B'))
+    pixels.frombytes(np.ascontiguousarray(image).data.cast('B'))
     message.data = pixels
     return message
 

@@ -33,7 +33,7 @@ import threading
 import time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nccs_pose.errors import NccsPoseError
+from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.plots import error_figure, trajectory_figure
 from nccs_pose.evaluation.tables import summary_table, table
@@ -46,6 +46,7 @@ from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_ns
 from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
 from nccs_pose.ros.resources import resolve, share_directory
+from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images
 import numpy as np
 import rclpy
@@ -141,7 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     _say(f'on ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, where you can watch')
     try:
-        rclpy.init(args=[])
+        initialise([])
         return _demo(options)
     except NccsPoseError as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -157,22 +158,25 @@ def _demo(options: argparse.Namespace) -> int:
     bag_path = resolve(options.bag)
     with BagReader(bag_path) as reader:
         truth, topics = reader.ground_truth(), reader.topics
+    image = topics.image
+    if image is None:
+        raise FileError(f'{bag_path}: has no images.')
     record = Record()
     with SerialisedBag(bag_path) as bag:
         pictures = np.linspace(bag.start_ns, bag.end_ns, PICTURES + 2)[1:-1].astype(int).tolist()
         user = DemoUser(record, options.output, pictures)
-        played = (topics.image, topics.camera_info, topics.odom)
+        played = (image, topics.camera_info, topics.odom)
         player = Player(user, bag, Playback(
             rate=options.rate, topics=tuple(topic for topic in played if topic)))
-        localiser = _start_localiser(options.params, topics.image, topics.camera_info, topics.odom)
+        localiser = _start_localiser(options.params, image, topics.camera_info, topics.odom)
         spinning = threading.Thread(target=_spin, args=(user,), daemon=True)
         spinning.start()
         try:
-            _say(f'localiser started; waiting until it listens to {topics.image}')
-            if not _listens(localiser, player, topics.image):
+            _say(f'localiser started; waiting until it listens to {image}')
+            if not _listens(localiser, player, image):
                 _say('the localiser does not listen: what it printed above says why')
                 return 1
-            _play(player, bag, topics.image, record, options.rate)
+            _play(player, bag, image, record, options.rate)
         finally:
             _stop(localiser)
             rclpy.try_shutdown()
@@ -187,7 +191,7 @@ def _start_localiser(
     remappings.append(f'image/compressed:={image}')
     remappings += [f'{name}:={topic}' for name, topic in (
         ('camera_info', camera_info), ('odom', odom)) if topic]
-    command = [sys.executable, '-m', 'nccs_pose.ros.localiser_node', '--ros-args',
+    command = [sys.executable, '-m', 'nccs_pose.ros.localiser', '--ros-args',
                '--params-file', str(resolve(params))]
     for remapping in remappings:
         command += ['-r', remapping]

@@ -69,8 +69,10 @@ class ImageStream:
         self._last_words = ''
         self.decode_s = 0.0
         self.arrived = time.monotonic()
+        # rclpy's annotations know of one argument only.
+        receive: Callable[..., None] = self._receive
         self._subscription = node.create_subscription(
-            kind, endpoint.name, self._receive, profile(endpoint),
+            kind, endpoint.name, receive, profile(endpoint),
             event_callbacks=SubscriptionEventCallbacks(
                 message_lost=self._lost, incompatible_qos=self._mismatched,
                 matched=self._matched),

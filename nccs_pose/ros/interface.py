@@ -99,6 +99,9 @@ STATUSES = (
     ('`localiser: time`',
      'decode_ms, predict_ms, detect_ms, associate_ms, measure_ms, refine_ms, total_ms, '
      'arrival_to_answer_ms'),
+    ('`localiser: calibration`',
+     'condition (`unknown`, `good`, `suspect`), frames, statistic, limit, pose_error_m; a warning '
+     'when the residuals say that the rig has moved'),
 )
 """The statuses in /diagnostics and their values."""
 
@@ -110,6 +113,8 @@ CAUSES = (
      'an image with the stamp of the last one, or an earlier one (less than `clock_jump`)'),
     ('`frozen_image`', 'an image that has not changed by a bit although the robot has moved'),
     ('`camera_info`', 'a camera_info that contradicts the rig'),
+    ('`undecodable`', 'bytes that are no message of the topic (of images the middleware hands on '
+     'none: they count as frames_dropped_busy)'),
     ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite, or '
      'no rotation'),
     ('`initialpose_frame`, `initialpose_pose`, `initialpose_covariance`',

@@ -21,13 +21,10 @@ parts are wired to the lifecycle.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from nccs_pose.errors import FrameRefusedError, NccsPoseError
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
@@ -35,33 +32,22 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.ros import diagnostics
-from nccs_pose.ros.camera_check import contradiction
-from nccs_pose.ros.conversions import read_initial_pose, read_odometry
+from nccs_pose.ros.calibration_watch import CalibrationWatch
 from nccs_pose.ros.image_stream import ImageStream
-from nccs_pose.ros.interface import (
-    CAMERA_INFO,
-    DIAGNOSTICS,
-    Endpoint,
-    INITIAL_POSE,
-    ODOM,
-    RELOCALISE,
-    SET_PAUSED,
-)
+from nccs_pose.ros.inputs import Inputs
+from nccs_pose.ros.interface import DIAGNOSTICS, RELOCALISE, SET_PAUSED
 from nccs_pose.ros.lifecycle import answer_every_request, in_words
 from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.pose_keeper import PoseKeeper
-from nccs_pose.ros.qos import overridable, profile
+from nccs_pose.ros.qos import profile
 from nccs_pose.ros.resources import resolve
-from nccs_pose.ros.spinning import run
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import SetBool, Trigger
 
 TRANSFORM_RETRY_PERIOD = 0.02
@@ -79,12 +65,12 @@ class LocaliserNode(LifecycleNode):
         self._outputs: Outputs | None = None
         self._stream: ImageStream | None = None
         self._keeper: PoseKeeper | None = None
-        self._subscriptions_of_active: list[Subscription] = []
+        self._inputs: Inputs | None = None
+        self._watch: CalibrationWatch | None = None
         self._estimate: Estimate | None = None
         self._pose_stamp_ns: int | None = None
         self._latency_s = 0.0
         self._paused = False
-        self._camera_problem = ''
         self._configuration_problem = ''
         self._shown: tuple[Any, ...] = ()
         self._reported = (0, 0)
@@ -165,55 +151,50 @@ class LocaliserNode(LifecycleNode):
         self._rig = rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
         self._localiser = Localiser(rig, line_map, estimator)
-        self._outputs = Outputs(self, self._options, rig, line_map, self._tally.refuse)
+        self._outputs = Outputs(self, self._options, rig, line_map, self._refuse)
         self._keeper = PoseKeeper(self._options, line_map, self.get_logger())
+        self._watch = CalibrationWatch(rig, line_map)
 
     def _activate(self) -> None:
-        assert self._localiser is not None and self._keeper is not None
+        assert self._localiser is not None and self._keeper is not None and self._rig is not None
         self._localiser.reset()
-        self._camera_problem = ''
         self._estimate = None
         self._pose_stamp_ns = None
         self._keeper.offer(self._localiser)
+        self._inputs = Inputs(
+            self, lambda: self._options, self._rig.camera, self._localiser, self._keeper,
+            self._refuse, self._report_diagnostics)
         self._stream = ImageStream(
             self, self._options.image_transport, self._tally, self._on_frame,
             self._report_diagnostics)
-        self._subscriptions_of_active = [
-            self._listen(CameraInfo, CAMERA_INFO, self._on_camera_info),
-            self._listen(Odometry, ODOM, self._on_odometry),
-            self._listen(PoseWithCovarianceStamped, INITIAL_POSE, self._on_initial_pose),
-        ]
         if self._options.tf_mode == 'map_to_odom':
             self._retry_timer.reset()
-
-    def _listen(self, kind: type, endpoint: Endpoint, callback: Any) -> Subscription:
-        return self.create_subscription(
-            kind, endpoint.name, callback, profile(endpoint),
-            qos_overriding_options=overridable())
 
     def _deactivate(self) -> None:
         self._retry_timer.cancel()
         if self._stream is not None:
             self._stream.close()
             self._stream = None
-        for subscription in self._subscriptions_of_active:
-            self.destroy_subscription(subscription)
-        self._subscriptions_of_active = []
+        if self._inputs is not None:
+            self._inputs.close()
+            self._inputs = None
         if self._keeper is not None:
             self._keeper.save()
 
     def _clean_up(self) -> None:
         if self._outputs is not None:
             self._outputs.close()
-        self._outputs = self._localiser = self._keeper = self._estimate = None
+        self._outputs = self._localiser = self._keeper = self._estimate = self._watch = None
 
     # Input
 
     def _on_frame(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> None:
         assert self._localiser is not None and self._outputs is not None
-        assert self._stream is not None and self._keeper is not None
+        assert self._stream is not None and self._inputs is not None
+        assert self._keeper is not None and self._watch is not None
         if self._paused:
             return
+        self._inputs.use_waiting_odometry()
         estimate = self._localiser.process(stamp_ns, image)
         if self._estimate is not None and stamp_ns < self._estimate.stamp_ns:
             back = 1e-9 * (self._estimate.stamp_ns - stamp_ns)
@@ -227,41 +208,9 @@ class LocaliserNode(LifecycleNode):
             self._pose_stamp_ns = stamp_ns
             self._keeper.remember(estimate)
         self._latency_s = time.monotonic() - self._stream.arrived
+        self._watch.look(estimate)
         if self._shown != self._summary():
             self._report_diagnostics()
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        assert self._rig is not None
-        if self._options.camera_info_check == 'off':
-            self._camera_problem = ''
-            return
-        words = contradiction(
-            message, self._rig.camera, self._options.camera_info_tolerance)
-        if words:
-            self._refuse('camera_info', words)
-        if words != self._camera_problem:
-            self._camera_problem = words
-            self._report_diagnostics()
-
-    def _on_odometry(self, message: Odometry) -> None:
-        assert self._localiser is not None
-        try:
-            stamp_ns, pose = read_odometry(message, self._options.odom, self._options.base)
-            self._localiser.add_odometry(stamp_ns, pose)
-        except FrameRefusedError as error:
-            self._refuse(error.cause, str(error))
-        except NccsPoseError as error:
-            self._refuse('odom_data', str(error))
-
-    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
-        assert self._localiser is not None and self._keeper is not None
-        try:
-            pose, covariance = read_initial_pose(message, self._options.map_frame)
-            self._keeper.give(self._localiser, pose, covariance)
-        except FrameRefusedError as error:
-            self._refuse(error.cause, str(error))
-        except NccsPoseError as error:
-            self._refuse('initialpose_data', str(error))
 
     def _on_relocalise(
         self, request: Trigger.Request, response: Trigger.Response,
@@ -304,8 +253,8 @@ class LocaliserNode(LifecycleNode):
 
     def _withheld(self) -> str:
         """Why no pose may leave, whatever the estimator says; empty if it may."""
-        if self._camera_problem and self._options.camera_info_check == 'refuse':
-            return self._camera_problem
+        if self._inputs is not None and self._options.camera_info_check == 'refuse':
+            return self._inputs.camera_problem
         return ''
 
     def _problem(self) -> str:
@@ -346,6 +295,8 @@ class LocaliserNode(LifecycleNode):
                 diagnostics.time_status(
                     name, self._estimate, self._stream.decode_s, self._latency_s)]
             self._reported = (troubles, tally.lost)
+        if self._watch is not None:
+            statuses.append(self._watch.status(name))
         self._shown = self._summary()
         self._diagnostics.publish(diagnostics.diagnostic_array(now.to_msg(), statuses))
 
@@ -355,12 +306,3 @@ def make_node() -> LocaliserNode:
     node = LocaliserNode()
     node.autostart()
     return node
-
-
-def main() -> int:
-    """Entry point of `ros2 run nccs_pose localiser`."""
-    return run(make_node)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

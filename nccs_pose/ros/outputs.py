@@ -70,11 +70,12 @@ class Outputs:
         :param estimator: the options it was made with.
         :returns: whether a pose was published.
         """
-        given = trusted and estimate.pose is not None and estimate.covariance is not None
-        if given:
+        given = False
+        if trusted and estimate.pose is not None and estimate.covariance is not None:
             self._pose.publish(pose_message(
                 estimate.stamp_ns, self._frame, estimate.pose, estimate.covariance))
             self.transforms.broadcast(estimate.stamp_ns, estimate.pose)
+            given = True
         if self._debug.get_subscription_count():
             drawn = draw_debug_image(image, self._rig, self._map, estimate, estimator)
             self._debug.publish(image_message(estimate.stamp_ns, frame_id, drawn))

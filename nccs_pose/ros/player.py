@@ -27,6 +27,7 @@ import time
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
+from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -168,7 +169,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         tuple(options.topics or ()))
     use_large_images()
     try:
-        rclpy.init(args=arguments)
+        initialise(arguments)
         with SerialisedBag(options.bag) as bag:
             node = rclpy.create_node('play')
             player = Player(node, bag, playback)

@@ -38,7 +38,7 @@ class PoseKeeper:
         self._path = Path(options.saved_pose_file).expanduser()
         self._map_hash = map_hash(line_map)
         self._logger = logger
-        self._good: Estimate | None = None
+        self._good: SavedPose | None = None
         self._saved_at = time.monotonic()
 
     def offer(self, localiser: Localiser) -> None:
@@ -63,8 +63,11 @@ class PoseKeeper:
 
     def remember(self, estimate: Estimate) -> None:
         """Note an estimate; only one that images support is worth keeping."""
-        if estimate.state is State.TRACKING:
-            self._good = estimate
+        if (estimate.state is State.TRACKING and estimate.pose is not None
+                and estimate.covariance is not None):
+            self._good = SavedPose(
+                estimate.stamp_ns, self._options.map_frame, self._map_hash, estimate.pose,
+                estimate.covariance)
 
     def save_if_due(self) -> None:
         """Save once in every interval."""
@@ -78,9 +81,7 @@ class PoseKeeper:
         if not self._options.saved_pose_file or good is None:
             return
         try:
-            write_saved_pose(self._path, SavedPose(
-                good.stamp_ns, self._options.map_frame, self._map_hash, good.pose,
-                good.covariance))
+            write_saved_pose(self._path, good)
         except FileError as error:
             self._logger.warning(f'the pose was not saved: {error}')
 

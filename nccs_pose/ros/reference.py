@@ -114,7 +114,7 @@ def _allowed(words: Any) -> str:
     return f'<= {high:g}' if low is None else f'{low:g} to {high:g}'
 
 
-def _left(rows: list[list[str]]) -> str:
+def _left(rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table of words: every column to the left, whatever its width."""
     lines = ['| ' + ' | '.join(row) + ' |' for row in rows]
     return '\n'.join([lines[0], '|' + ':--|' * len(rows[0]), *lines[1:]]) + '\n'

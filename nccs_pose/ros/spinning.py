@@ -27,6 +27,7 @@ import sys
 import traceback
 from typing import Any
 
+from nccs_pose.ros.start import initialise, StartError
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -93,18 +94,16 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     """
     node: Node | None = None
     try:
-        try:
-            rclpy.init(args=args)
-        except RuntimeError as error:  # base of every RCLError
-            # A parameter file that is not there, a remapping that cannot be read.
-            print(f'cannot start: {" ".join(str(error).split())}', file=sys.stderr)
-            return 2
+        initialise(args)
         node = make_node()
         executor = GuardedExecutor(getattr(node, 'report', None) or _log(node))
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except StartError as error:
+        print(error, file=sys.stderr)
+        return 2
     finally:
         try:
             if node is not None:

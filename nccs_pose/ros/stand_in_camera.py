@@ -39,6 +39,7 @@ from nccs_pose.ros.conversions import (
 )
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.resources import resolve
+from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import (
     ImageSample,
@@ -160,7 +161,7 @@ def main() -> int:
     """Entry point of `ros2 run nccs_pose stand_in_camera`."""
     use_large_images()
     try:
-        rclpy.init()
+        initialise()
         node = StandInCamera()
         node.drive()
     except (KeyboardInterrupt, ExternalShutdownException):

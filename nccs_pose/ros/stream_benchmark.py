@@ -15,14 +15,16 @@
 """Does the node keep up with its camera? Images at 30 Hz from another process, for a minute.
 
 Prints, for raw and for JPEG images: how many arrived, the latency from an image's publication to
-its pose, the node's share of a CPU and its memory at the start and the end.
+its pose, the node's share of a core, its memory early and at the end, what decoding and
+estimation took of it, and how loaded the machine was.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+import itertools
 import os
 from pathlib import Path
 import platform
@@ -33,10 +35,12 @@ import time
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nccs_pose.errors import NccsPoseError
 from nccs_pose.evaluation.tables import table
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.conversions import compressed_message, image_message, stamp_to_ns
 from nccs_pose.ros.resources import resolve, share_directory
+from nccs_pose.ros.start import initialise, StartError
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import make_drive, render_frame
 from nccs_pose.simulation.motion import figure_of_eight
@@ -45,7 +49,7 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 
 RIG = 'config/arena_rig.yaml'
@@ -54,24 +58,33 @@ DISTINCT_FRAMES = 30
 """Rendered beforehand and played to and fro, so that the robot never jumps."""
 
 
+WARM_UP = 1.0
+"""Seconds of images before the count begins: the first image is searched as a whole."""
+PATIENCE = 30.0
+"""Seconds until the node must have been heard."""
+COUNTS = ('frames_received', 'frames_dropped_busy', 'frames_lost_by_middleware')
+
+
 @dataclass(frozen=True)
 class Result:
     """One stream's numbers.
 
     :ivar sent: images.
-    :ivar received: of them, those that reached the node's callback.
+    :ivar counts: COUNTS of the node, of these images.
     :ivar latency: seconds from publication to pose (N,).
     :ivar cpu: of one core.
     :ivar memory_mb: resident, after a fifth of the run and at its end.
+    :ivar stages_ms: medians of decoding and of estimating, of the images that were reported.
+    :ivar load: the machine's load average at the end, of one minute.
     """
 
     sent: int
-    received: int
-    busy: int
-    lost: int
+    counts: tuple[int, ...]
     latency: np.ndarray
     cpu: float
     memory_mb: tuple[float, float]
+    stages_ms: tuple[float, float]
+    load: float
 
 
 class Listener(Node):
@@ -84,9 +97,10 @@ class Listener(Node):
         self.images = self.create_publisher(kind, name, QoSProfile(depth=2))
         self.sent: dict[int, float] = {}
         self.latency: list[float] = []
-        self.counts: dict[str, str] = {}
+        self.stages: list[tuple[float, float]] = []
+        self.values: dict[str, str] = {}
         self.create_subscription(
-            PoseWithCovarianceStamped, 'pose', self._on_pose, qos_profile_sensor_data)
+            PoseWithCovarianceStamped, 'pose', self._on_pose, QoSProfile(depth=100))
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def send(self, frame: np.ndarray | bytes) -> None:
@@ -98,6 +112,14 @@ class Listener(Node):
         self.sent[stamp_ns] = time.monotonic()
         self.images.publish(message)
 
+    def forget(self) -> None:
+        """Begin to count anew."""
+        self.sent, self.latency, self.stages = {}, [], []
+
+    def counts(self) -> tuple[int, ...]:
+        """COUNTS as last reported."""
+        return tuple(int(self.values.get(name, '0')) for name in COUNTS)
+
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         sent = self.sent.get(stamp_to_ns(message.header.stamp))
         if sent is not None:
@@ -105,8 +127,11 @@ class Listener(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
             if status.name == 'localiser: images':
-                self.counts = {pair.key: pair.value for pair in status.values}
+                self.values = values
+            elif status.name == 'localiser: time' and 'total_ms' in values:
+                self.stages.append((float(values['decode_ms']), float(values['total_ms'])))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -124,15 +149,19 @@ def main(argv: Sequence[str] | None = None) -> int:
           f'rendering {DISTINCT_FRAMES} frames', flush=True)
     frames = _frames()
     rows = [['1280 x 960', 'sent', 'received', 'dropped busy', 'lost', 'poses', 'p50 (ms)',
-             'p99 (ms)', 'CPU (% of a core)', 'memory (MB)']]
+             'p99 (ms)', 'decode (ms)', 'estimate (ms)', 'CPU (% of a core)', 'memory (MB)',
+             'load']]
     whole = True
     try:
         for name in options.formats:
             result = _run(name == 'jpeg', frames, options.seconds, options.rate)
-            whole = whole and result.received == result.sent
+            whole = whole and result.counts[0] == result.sent
             rows.append(_row(name, result))
     except (KeyboardInterrupt, ExternalShutdownException):
         return 130
+    except NccsPoseError as error:
+        print(f'stream_benchmark: {error}', file=sys.stderr)
+        return 2
     print(table(rows))
     return 0 if whole else 1
 
@@ -150,15 +179,17 @@ def _run(compressed: bool, frames: list[np.ndarray], seconds: float, rate: float
     if compressed:
         prepared = [cv2.imencode('.jpg', frame, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
                     for frame in frames]
-    rclpy.init(args=[])
+    initialise([])
     process = _start_localiser(compressed)
     try:
         node = Listener(compressed)
-        while not node.images.get_subscription_count():
-            if process.poll() is not None:
-                raise RuntimeError('the localiser ended before it listened')
+        end = time.monotonic() + PATIENCE
+        # Both sides must know of each other: what is sent before is lost.
+        while not node.images.get_subscription_count() or node.values.get('publishers') != '1':
+            if process.poll() is not None or time.monotonic() > end:
+                raise StartError('the localiser does not listen')
             rclpy.spin_once(node, timeout_sec=0.1)
-        return _stream(node, prepared, process.pid, seconds, rate)
+        return _measure(node, prepared, process.pid, seconds, rate)
     finally:
         process.terminate()
         process.wait(15.0)
@@ -168,44 +199,61 @@ def _run(compressed: bool, frames: list[np.ndarray], seconds: float, rate: float
 def _start_localiser(compressed: bool) -> subprocess.Popen[bytes]:
     parameters = {'rig_file': RIG, 'map_file': MAP,
                   'image_transport': 'compressed' if compressed else 'raw'}
-    command = [sys.executable, '-m', 'nccs_pose.ros.localiser_node', '--ros-args']
+    command = [sys.executable, '-m', 'nccs_pose.ros.localiser', '--ros-args']
     for name, value in parameters.items():
         command += ['-p', f'{name}:={value}']
     return subprocess.Popen(command, cwd=share_directory())
 
 
-def _stream(
+def _measure(
     node: Listener, frames: Sequence[np.ndarray | bytes], pid: int, seconds: float, rate: float,
 ) -> Result:
-    count = round(seconds * rate)
     # To and fro: 0 1 2 ... n-1 ... 2 1, again and again.
-    order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+    order = itertools.cycle([*range(len(frames)), *range(len(frames) - 2, 0, -1)])
+    stream = (frames[k] for k in order)
+    _play(node, stream, round(WARM_UP * rate), rate)
+    before = _settle(node, (0,) * len(COUNTS), len(node.sent))
+    node.forget()
+    count = round(seconds * rate)
     start, cpu = time.monotonic(), _cpu_seconds(pid)
-    early = 0.0
+    _play(node, stream, count // 5, rate)
+    early = _memory_mb(pid)
+    _play(node, stream, count - count // 5, rate)
+    share = (_cpu_seconds(pid) - cpu) / (time.monotonic() - start)
+    late, load = _memory_mb(pid), os.getloadavg()[0]
+    after = _settle(node, before, count)
+    decode, total = np.median(node.stages, axis=0) if node.stages else (np.nan, np.nan)
+    node.destroy_node()
+    return Result(
+        count, tuple(b - a for a, b in zip(before, after)), np.array(node.latency), share,
+        (early, late), (float(decode), float(total)), load)
+
+
+def _play(
+    node: Listener, stream: Iterator[np.ndarray | bytes], count: int, rate: float,
+) -> None:
+    start = time.monotonic()
     for k in range(count):
         while (left := start + k / rate - time.monotonic()) > 0.0:
             rclpy.spin_once(node, timeout_sec=left)
-        node.send(frames[order[k % len(order)]])
-        if k == count // 5:
-            early = _memory_mb(pid)
-    elapsed = time.monotonic() - start
-    share, late = (_cpu_seconds(pid) - cpu) / elapsed, _memory_mb(pid)
-    end = time.monotonic() + 3.0  # the last answers, and one more report
-    while time.monotonic() < end:
+        node.send(next(stream))
+
+
+def _settle(node: Listener, before: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """The node's counts once it has accounted for `count` images more, or gives no more news."""
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end and sum(node.counts()) < sum(before) + count:
         rclpy.spin_once(node, timeout_sec=0.1)
-    counts = {key: int(node.counts.get(key, '0')) for key in (
-        'frames_received', 'frames_dropped_busy', 'frames_lost_by_middleware')}
-    node.destroy_node()
-    return Result(
-        count, *counts.values(), np.array(node.latency), share, (early, late))
+    return node.counts()
 
 
 def _row(name: str, result: Result) -> list[str]:
     p50, p99 = (1e3 * np.percentile(result.latency, (50, 99)) if len(result.latency)
                 else (float('nan'), float('nan')))
-    return [name, str(result.sent), str(result.received), str(result.busy), str(result.lost),
-            str(len(result.latency)), f'{p50:.1f}', f'{p99:.1f}', f'{100.0 * result.cpu:.0f}',
-            f'{result.memory_mb[0]:.0f} -> {result.memory_mb[1]:.0f}']
+    return [name, str(result.sent), *(str(n) for n in result.counts),
+            str(len(result.latency)), f'{p50:.1f}', f'{p99:.1f}',
+            *(f'{ms:.1f}' for ms in result.stages_ms), f'{100.0 * result.cpu:.0f}',
+            f'{result.memory_mb[0]:.0f} -> {result.memory_mb[1]:.0f}', f'{result.load:.1f}']
 
 
 def _cpu_seconds(pid: int) -> float:

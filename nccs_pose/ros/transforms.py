@@ -22,6 +22,7 @@ missing nothing is broadcast.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -29,12 +30,14 @@ from geometry_msgs.msg import TransformStamped
 from nccs_pose.errors import FrameRefusedError, OptionError
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import ns_to_stamp, planar_to_pose, pose_to_planar, yaw_quaternion
+from nccs_pose.ros.inputs import waiting
 from nccs_pose.ros.node_options import NodeOptions
 from rclpy.node import Node
 from rclpy.time import Time
 
 PATIENCE_NS = 1_000_000_000
 """How long an estimate waits for the odometry transform at its stamp."""
+MOST_WAITING = 100
 
 
 class TransformOutput:
@@ -52,7 +55,7 @@ class TransformOutput:
         """
         self._options = options
         self._refuse = refuse
-        self._pending: tuple[int, Pose2] | None = None
+        self._pending: deque[tuple[int, Pose2]] = deque(maxlen=MOST_WAITING)
         self._buffer: Any = None
         self._listener: Any = None
         self._broadcaster: Any = None
@@ -74,37 +77,46 @@ class TransformOutput:
     @property
     def waits(self) -> bool:
         """Whether an estimate still waits for its odometry transform."""
-        return self._pending is not None
+        return bool(self._pending)
 
     def broadcast(self, stamp_ns: int, pose: Pose2) -> None:
         """Broadcast the transform of a new estimate T_map_base, now or when it can be made."""
         if self._options.tf_mode == 'map_to_base':
             self._send(stamp_ns, self._options.base, pose)
         elif self._options.tf_mode == 'map_to_odom':
-            self._pending = (stamp_ns, pose)
+            if self._pending and stamp_ns < self._pending[-1][0]:
+                self._pending.clear()  # the clock was set back
+            self._pending.append((stamp_ns, pose))
             self.retry(stamp_ns)
 
     def retry(self, now_ns: int) -> None:
-        """Try again what waits; give it up once it is older than the patience."""
-        if self._pending is None:
+        """Try again what waits, oldest first; give up what is older than the patience."""
+        if not self._pending:
             return
-        stamp_ns, pose = self._pending
-        try:
-            found = self._buffer.lookup_transform(
-                self._options.odom, self._options.base, Time(nanoseconds=stamp_ns))
-        except self._not_yet as error:
-            if now_ns - stamp_ns > PATIENCE_NS:
-                self._pending = None
+        # The listener's callbacks wait behind the images, as everything else does.
+        for message in waiting(self._listener.tf_sub, MOST_WAITING):
+            self._listener.callback(message)
+        while self._pending:
+            stamp_ns, pose = self._pending[0]
+            try:
+                found = self._buffer.lookup_transform(
+                    self._options.odom, self._options.base, Time(nanoseconds=stamp_ns))
+            except self._not_yet as error:
+                if now_ns - stamp_ns <= PATIENCE_NS:
+                    return
                 self._refuse('tf_missing', f'no transform {self._options.odom} -> '
                              f'{self._options.base} at the image: {error}')
-            return
-        self._pending = None
+            else:
+                self._pass_on(stamp_ns, pose, found)
+            self._pending.popleft()
+
+    def _pass_on(self, stamp_ns: int, pose: Pose2, found: TransformStamped) -> None:
         try:
             odom_base = planar_transform(found)
         except FrameRefusedError as error:
             self._refuse('tf_pose', str(error))
-            return
-        self._send(stamp_ns, self._options.odom, pose @ odom_base.inverse())
+        else:
+            self._send(stamp_ns, self._options.odom, pose @ odom_base.inverse())
 
     def close(self) -> None:
         """Stop listening."""

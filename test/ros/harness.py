@@ -184,7 +184,7 @@ class World:
                 continue
             text = str(value).lower() if isinstance(value, bool) else value
             arguments += ['-p', f'{name}:={text}']
-        return self.start('localiser_node', *arguments)
+        return self.start('localiser', *arguments)
 
     def close(self) -> None:
         """End everything."""

@@ -125,7 +125,7 @@ def test_pause_is_said(world):
 @pytest.mark.parametrize('arguments', [
     ('--params-file', 'nowhere.yaml'), ('--no-such-option',), ('-r', '3:4:5')])
 def test_ros_arguments_that_cannot_be_read_are_said_in_a_sentence(world, arguments):
-    node = world.start('localiser_node', '--ros-args', *arguments)
+    node = world.start('localiser', '--ros-args', *arguments)
     assert node.wait() == 2
     assert 'cannot start: ' in node.output
     assert 'Traceback' not in node.output

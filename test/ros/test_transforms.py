@@ -40,17 +40,37 @@ class TransformError(Exception):
     """What a lookup raises."""
 
 
+class Waiting:
+    """A subscription with messages whose callback has not run yet."""
+
+    msg_type, raw = None, False
+
+    def __init__(self) -> None:
+        self.messages: list[object] = []
+        self.handle = self
+
+    def __enter__(self) -> None:
+        """As a handle is held."""
+
+    def __exit__(self, *error: object) -> None:
+        """And let go."""
+
+    def take_message(self, kind: object, raw: bool) -> tuple[object, dict] | None:
+        return (self.messages.pop(0), {}) if self.messages else None
+
+
 class Tf2:
     """A transform tree of odom -> base_link, and what was broadcast."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.known: dict[tuple[str, str, int], TransformStamped] = {}
         self.sent: list[TransformStamped] = []
+        self.arrived = Waiting()
         module = types.ModuleType('tf2_ros')
         module.TransformException = TransformError
         module.Buffer = lambda node: types.SimpleNamespace(lookup_transform=self.lookup)
         module.TransformListener = lambda buffer, node: types.SimpleNamespace(
-            unregister=lambda: None)
+            unregister=lambda: None, tf_sub=self.arrived, callback=lambda item: self.add(*item))
         module.TransformBroadcaster = lambda node: types.SimpleNamespace(
             sendTransform=self.sent.append)
         monkeypatch.setitem(sys.modules, 'tf2_ros', module)
@@ -121,6 +141,33 @@ def test_late_odometry_is_waited_for_and_missing_odometry_is_counted(tf2: Tf2):
     assert not out.waits
     assert len(tf2.sent) == 1
     assert refusals == ['tf_missing']
+
+
+def test_no_estimate_is_lost_while_the_odometry_lags_behind_the_camera(tf2: Tf2):
+    out, refusals = output(tf_mode='map_to_odom')
+    period = 33_000_000
+    for k in range(10):  # odometry comes four images late
+        out.broadcast(STAMP + k * period, Pose2(1.0 + k, 2.0, 0.5))
+        if k >= 4:
+            tf2.add('odom', 'base_link', STAMP + (k - 4) * period, Pose2())
+            out.retry(STAMP + k * period)
+    assert [m.header.stamp for m in tf2.sent] == [ns_to_stamp(STAMP + k * period)
+                                                  for k in range(6)]
+    assert [m.transform.translation.x for m in tf2.sent] == [1.0 + k for k in range(6)]
+    assert refusals == []
+    # The clock is set back: what waits for the future does not hold up the present.
+    tf2.add('odom', 'base_link', 5, Pose2())
+    out.broadcast(5, Pose2(-1.0, 0.0, 0.0))
+    assert tf2.sent[-1].header.stamp == ns_to_stamp(5)
+    assert not out.waits
+
+
+def test_transforms_that_wait_behind_the_image_are_used_for_it(tf2: Tf2):
+    out, _ = output(tf_mode='map_to_odom')
+    tf2.arrived.messages = [('odom', 'base_link', STAMP, Pose2(3.0, 0.0, 0.0))]
+    out.broadcast(STAMP, Pose2(1.0, 0.0, 0.0))
+    (sent,) = tf2.sent
+    assert sent.transform.translation.x == pytest.approx(-2.0)
 
 
 def test_odometry_that_is_no_rotation_is_not_passed_on(tf2: Tf2):

@@ -1,0 +1,41 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Entry point of `ros2 run nccs_pose localiser`.
+
+Light on purpose: SIGINT and SIGTERM end the program with exit code 0 from here on, also during
+the second that the imports of the node take.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+
+def main() -> int:
+    """Run the node until it is told to stop."""
+    # ROS passes the signal on to this handler, so that it means the same before and after.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        from nccs_pose.ros.localiser_node import make_node
+        from nccs_pose.ros.spinning import run
+
+        return run(make_node)
+    except KeyboardInterrupt:
+        return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
