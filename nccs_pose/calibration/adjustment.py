@@ -28,6 +28,7 @@ from dataclasses import dataclass
 
 from nccs_pose.calibration.observations import Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
+from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.calibration.sensitivity import IncidentRays, side_sensitivity
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array
@@ -37,6 +38,7 @@ from numpy.typing import NDArray
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
 _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
+_BEYOND = 3.0  # standard deviations: scatter of the pulls that is no chance
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
 # A pose is somewhere within 100 m and 10 rad: keeps every block regular, moves nothing.
 _VAGUE = np.diag([1e-4, 1e-4, 1e-2])
@@ -62,18 +64,23 @@ class Linearisation:
 class ArrowSystem:
     """Normal equations of F frames: rig (P), poses (F, 3), and what couples them.
 
-    :ivar rig: (P, P).
+    :ivar rigs: each frame's part of the rig's block (F, P, P).
     :ivar poses: (F, 3, 3).
     :ivar coupling: (F, 3, P).
-    :ivar rig_slope: (P,).
+    :ivar rig_slopes: each frame's part (F, P).
     :ivar pose_slopes: (F, 3).
     """
 
-    rig: Array
+    rigs: Array
     poses: Array
     coupling: Array
-    rig_slope: Array
+    rig_slopes: Array
     pose_slopes: Array
+
+    @property
+    def rig(self) -> Array:
+        """The rig's block (P, P)."""
+        return self.rigs.sum(axis=0)
 
     @classmethod
     def of(cls, terms: Linearisation, weight: Array, slices: list[slice]) -> ArrowSystem:
@@ -81,17 +88,15 @@ class ArrowSystem:
         p = terms.by_rig.shape[1]
         both = np.concatenate([terms.by_pose, terms.by_rig], axis=1)
         weighted = both * weight[:, None]
-        rig, slope = np.zeros((p, p)), np.zeros(p)
+        rigs, slopes = np.zeros((len(slices), p, p)), np.zeros((len(slices), p))
         poses, coupling = np.zeros((len(slices), 3, 3)), np.zeros((len(slices), 3, p))
         pose_slopes = np.zeros((len(slices), 3))
         for f, rows in enumerate(slices):
             block = weighted[rows].T @ both[rows]
             pull = weighted[rows].T @ terms.residual[rows]
             poses[f], coupling[f] = block[:3, :3], block[:3, 3:]
-            pose_slopes[f] = pull[:3]
-            rig += block[3:, 3:]
-            slope += pull[3:]
-        return cls(rig, poses, coupling, slope, pose_slopes)
+            rigs[f], pose_slopes[f], slopes[f] = block[3:, 3:], pull[:3], pull[3:]
+        return cls(rigs, poses, coupling, slopes, pose_slopes)
 
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
         """Eliminate the poses (Schur's complement).
@@ -102,9 +107,16 @@ class ArrowSystem:
         diagonal = np.einsum('fii->fi', self.poses)
         poses = self.poses + _VAGUE + damping * np.eye(3) * diagonal[:, None, :]
         gain = np.linalg.solve(poses, self.coupling)
-        rig = self.rig + damping * np.diag(np.diag(self.rig))
+        rig = self.rig
+        rig = rig + damping * np.diag(np.diag(rig))
         return (rig - np.einsum('fip,fiq->pq', self.coupling, gain),
-                self.rig_slope - np.einsum('fip,fi->p', gain, self.pose_slopes), gain)
+                self.rig_slopes.sum(axis=0) - np.einsum('fip,fi->p', gain, self.pose_slopes), gain)
+
+    def pulls(self) -> tuple[Array, Array]:
+        """Slope (F, P) and curvature (F, P, P) of each frame alone, its pose eliminated."""
+        gain = np.linalg.solve(self.poses + _VAGUE, self.coupling)
+        return (self.rig_slopes - np.einsum('fip,fi->fp', gain, self.pose_slopes),
+                self.rigs - np.einsum('fip,fiq->fpq', self.coupling, gain))
 
     def solve(self, theta: Array, spread: Array, damping: float) -> tuple[Array, Array]:
         """Step of the rig (P,) and of the poses (F, 3)."""
@@ -133,6 +145,7 @@ class Adjustment:
     :ivar inlier: which points it rests on (N,).
     :ivar scale: robust standard deviation of the residuals; 1 when the noise is as told.
     :ivar reduced_chi2: of the inliers, per degree of freedom.
+    :ivar shared: scatter of the frames' pulls over that of independent noise; 1 if it is chance.
     :ivar converged: whether the last step was negligible.
     :ivar iterations: steps taken.
     """
@@ -147,6 +160,7 @@ class Adjustment:
     inlier: NDArray[np.bool_]
     scale: float
     reduced_chi2: float
+    shared: float
     converged: bool
     iterations: int
 
@@ -213,13 +227,16 @@ def adjust(
     chi2 = float(e @ e) / degrees
     system = ArrowSystem.of(terms, inlier.astype(float), problem.slices)
     information, _, gain = system.reduced()
-    # Residuals larger than the noise was told to be widen the claim; smaller ones do not
-    # narrow it.
-    information = 0.5 * (information + information.T) / max(1.0, chi2)
+    # Residuals larger than the noise was told to be widen the claim, and so do errors that the
+    # points of a frame share; smaller ones do not narrow it.
+    found = pull_statistics(*system.pulls(), parameters.spread)
+    chance = 1.0 + _BEYOND * np.sqrt(2.0 / (max(found.freedom, 1) * observations.frames))
+    shared = found.scatter if found.scatter > chance else 1.0
+    information = 0.5 * (information + information.T) / max(1.0, chi2, shared)
     return Adjustment(
         parameters.model(theta, with_rim=True), theta, poses, information,
         posterior(information, parameters.spread), gain, terms.residual, inlier, scale, chi2,
-        ended and finished, used + more)
+        shared, ended and finished, used + more)
 
 
 def posterior(information: Array, spread: Array) -> Array:

@@ -62,10 +62,7 @@ def frame_information(
     terms = problem.linearise(theta, poses)
     weight = terms.hit.astype(float)
     system = ArrowSystem.of(terms, weight, problem.slices)
-    gain = system.reduced()[2]
-    own = np.array([terms.by_rig[rows].T @ terms.by_rig[rows] for rows in problem.slices])
-    return FrameInformation(
-        own - np.einsum('fip,fiq->fpq', system.coupling, gain), gain, np.asarray(poses))
+    return FrameInformation(system.pulls()[1], system.reduced()[2], np.asarray(poses))
 
 
 def choose(frames: FrameInformation, spread: Array, most: int) -> NDArray[np.intp]:

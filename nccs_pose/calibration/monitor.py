@@ -45,13 +45,14 @@ from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
+from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.options import check_options, option
 import numpy as np
-from scipy.special import fdtri
+from scipy.stats import f as fisher
 
 _CAUCHY = 2.385
 _LEAST_LINES = 2
@@ -224,24 +225,13 @@ class CalibrationMonitor:
 
     def _regularity(self, slopes: Array, curvatures: Array) -> tuple[float, float]:
         """The summed pull against chance, for slopes (K, P) and curvatures (K, P, P)."""
-        spread = self._parameters.spread
-        values, vectors = np.linalg.eigh(curvatures.sum(axis=0) * np.outer(spread, spread))
-        seen = values > 1.0
-        freedom, places = int(seen.sum()), len(slopes)
-        if not freedom:
+        found = pull_statistics(slopes, curvatures, self._parameters.spread)
+        if not found.freedom:
             return 0.0, float('inf')
-        # In units in which the noise that was told makes every part of the sum 1.
-        units = spread[:, None] * vectors[:, seen] / np.sqrt(values[seen])
-        pulls = slopes @ units
-        shares = np.einsum('pi,kpq,qj->kij', units, curvatures, units)
-        total = pulls.sum(axis=0)
-        left = pulls - shares @ total
-        # What noise as told would leave; a place that alone fixes something leaves less.
-        expected = freedom - float(np.sum(shares**2))
-        chance = max(1.0, float(np.sum(left**2)) / max(expected, 1e-3 * freedom))
         # One degree of freedom a place for the size of chance, however many parts each has.
-        limit = freedom * float(fdtri(freedom, places - 1, 1.0 - self.options.false_alarm))
-        return float(total @ total) / chance, limit
+        limit = found.freedom * float(
+            fisher.isf(self.options.false_alarm, found.freedom, len(slopes) - 1))
+        return found.squared / max(1.0, found.scatter), limit
 
     def _step(self, free: Array, pull: Array, information: Array) -> Array:
         """What change of the free numbers (P,) of the rig the pulls ask for, (P,)."""

@@ -152,7 +152,7 @@ def _weak(
     all_of_it = RigParameters(model.rig, model.line_map, options, names, hold_gauge=False)
     terms = Problem(all_of_it, observations).linearise(np.zeros(len(all_of_it)), result.poses)
     system = ArrowSystem.of(terms, result.inlier.astype(float), observations.slices())
-    information = system.reduced()[0] / max(1.0, result.reduced_chi2)
+    information = system.reduced()[0] / max(1.0, result.reduced_chi2, result.shared)
     return weak_directions(information, all_of_it, model)
 
 
