@@ -25,6 +25,7 @@ from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.refine import refine
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Judgement:
     """Residuals of F frames, N points in all.
 
     :ivar pixels: the points (N, 2).
+    :ivar line: the lines of the map that they are on (N,).
     :ivar residual_before: distance to the line under the rough rig (N,), px; NaN where the ray
         misses or no pose fits.
     :ivar residual_after: under the refined rig (N,), px.
@@ -40,6 +42,7 @@ class Judgement:
     """
 
     pixels: Array
+    line: NDArray[np.intp]
     residual_before: Array
     residual_after: Array
     poses: Array
@@ -83,6 +86,7 @@ def judge(
     scores = np.array(whitened)
     return Judgement(
         np.concatenate([f.points.pixels for f in frames]) if frames else np.zeros((0, 2)),
+        np.concatenate([f.points.label for f in frames]) if frames else np.zeros(0, dtype=np.intp),
         np.concatenate(before) if frames else none, np.concatenate(after) if frames else none,
         np.array(found).reshape(-1, 3), np.where(np.isfinite(scores), scores, np.inf))
 

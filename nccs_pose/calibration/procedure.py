@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 
 _LEAST_LINES = 2
 _START_FRAMES = 12
+_MOST_SCALE = 2.0  # residuals over the noise that was measured
 _NO_WORSE = 1.5  # held-out residuals over those of the fit
 
 
@@ -113,12 +114,12 @@ def calibrate(
     model, rough = result.model, parameters.rough
     fit = judge(rough, model, [thin[i] for i in chosen], result.poses)
     held_out = judge(rough, model, [thin[i] for i in held], all_poses[held])
-    good, verdict = _verdict(first, result, fit, held_out)
+    uncertainty = pose_uncertainty(result.pose_gain, result.poses, result.covariance)
+    good, verdict = _verdict(first, result, uncertainty, fit, held_out, options)
     return Calibration(
         parameters, result, observations, _weak(parameters, model, observations, result, options),
         seen_covariance(result.information, parameters.spread),
-        pose_uncertainty(result.pose_gain, result.poses, result.covariance), fit, held_out,
-        verdict, good)
+        uncertainty, fit, held_out, verdict, good)
 
 
 def converge(
@@ -228,17 +229,31 @@ def _demand_knowledge(
 
 
 def _verdict(
-    first: Start, result: Adjustment, fit: Judgement, held_out: Judgement,
+    first: Start, result: Adjustment, uncertainty: PoseUncertainty, fit: Judgement,
+    held_out: Judgement, options: CalibrationOptions,
 ) -> tuple[bool, str]:
+    """Whether the rig is to be used, and why."""
     if not result.converged:
         return False, 'not to be used: the adjustment did not converge'
     if held_out.frames and held_out.after > _NO_WORSE * max(fit.after, 1e-3):
         return False, (
             f'not to be used: frames held out from the fit have residuals of '
             f'{held_out.after:.3f} px, the fitted ones {fit.after:.3f} px')
+    if result.scale > _MOST_SCALE:
+        return False, (
+            f'not to be used: the residuals are {result.scale:.1f} times the noise that was '
+            "measured; a line of the map, the mirror's shape or the intrinsics are not as told")
+    if uncertainty.position > options.pose_error:
+        return False, (
+            f'not to be used: the pose may still be off by {1e3 * uncertainty.position:.1f} mm '
+            f'(allowed: {1e3 * options.pose_error:.1f} mm)')
     noise = f'{result.scale:.2f} times the noise that was measured'
-    return True, (
+    words = (
         f'to be used: residuals fell from {held_out.before:.3f} px to {held_out.after:.3f} px '
         f'on {held_out.frames} frames held out from the fit ({noise}); '
         f'{100.0 * first.agreement:.0f} % of the first frames agreed')
-
+    if result.shared > 1.0:
+        words += (
+            f'; the points of a frame share errors, which make the standard deviations '
+            f'{np.sqrt(result.shared):.1f} times as large')
+    return True, words

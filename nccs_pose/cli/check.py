@@ -22,7 +22,6 @@ from pathlib import Path
 from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
 from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
-from nccs_pose.calibration.observations import FrameObservation
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
@@ -67,22 +66,19 @@ def run(args: argparse.Namespace) -> int:
     print(f'images followed: {len(measured.frames)} of {measured.seen}')
     for reason, count in measured.reasons.most_common(3):
         print(f'  {count} not: {reason}')
-    _print_structure(judged, measured.frames, line_map)
+    _print_structure(judged, line_map)
     print(f'structure against noise: {verdict.statistic:.0f} (noise alone stays below '
           f'{verdict.limit:.0f})')
     print(verdict.words)
     return 0 if verdict.condition is Condition.GOOD else 1
 
 
-def _print_structure(
-    judged: Judgement, frames: list[FrameObservation], line_map: LineMap,
-) -> None:
+def _print_structure(judged: Judgement, line_map: LineMap) -> None:
     """Residuals by line: the mean is structure, the deviation is noise."""
     residual = judged.residual_after
-    label = np.concatenate([frame.points.label for frame in frames])
     print(f'residuals: {robust_deviation(residual):.3f} px, by line:')
     for index, line in enumerate(line_map):
-        own = residual[(label == index) & np.isfinite(residual)]
+        own = residual[(judged.line == index) & np.isfinite(residual)]
         if len(own):
             print(f'  {line.name or index}: mean {own.mean():+.3f} px, deviation '
                   f'{own.std():.3f} px, {len(own)} points')

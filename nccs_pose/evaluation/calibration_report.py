@@ -54,7 +54,8 @@ def report_text(calibration: Calibration, pictures: tuple[str, ...] = ()) -> str
         f'| {held.after:.3f} |', '',
         f'After the fit they are {c.adjustment.scale:.2f} times the noise that was measured in '
         f'the images (chi-squared per degree of freedom {c.adjustment.reduced_chi2:.2f}); '
-        f'{100.0 * c.adjustment.inlier.mean():.1f} % of the points are inliers.', '',
+        f'{100.0 * c.adjustment.inlier.mean():.1f} % of the points are inliers. {_shared(c)}', '',
+        *_by_line(c), '',
         '## What the remaining uncertainty means', '',
         f'- A pose: {1e3 * u.position:.2f} mm and {np.rad2deg(u.heading):.4f}°, root mean square '
         'over the poses of the drive.',
@@ -81,6 +82,30 @@ def _parameter_table(c: Calibration) -> list[str]:
         told = deviation(p, s) if s > 0.0 else 'held by the rough rig'
         rows.append(
             f'| {p.words} | {before} | {after} | {amount(change, p.unit)} | {told} |')
+    return rows
+
+
+def _shared(c: Calibration) -> str:
+    """What the scatter between frames says."""
+    if c.adjustment.shared <= 1.0:
+        return 'The frames differ by no more than that noise explains.'
+    return (
+        f'The frames differ by {np.sqrt(c.adjustment.shared):.1f} times as much as that noise '
+        'explains: their points share errors (of the map, of the shape of the mirror, of what '
+        'lies beside the lines). The standard deviations are that much larger.')
+
+
+def _by_line(c: Calibration) -> list[str]:
+    """Residuals of the held-out frames line by line: a mean is structure."""
+    rows = ['| line, held-out frames | points | mean before, px | mean after, px |',
+            '|---|---|---|---|']
+    for index, line in enumerate(c.model.line_map):
+        own = c.held_out.line == index
+        if own.any():
+            before, after = (
+                _finite(r[own]).mean() if np.isfinite(r[own]).any() else np.nan
+                for r in (c.held_out.residual_before, c.held_out.residual_after))
+            rows.append(f'| {line.name or index} | {own.sum()} | {before:+.3f} | {after:+.3f} |')
     return rows
 
 
