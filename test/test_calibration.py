@@ -23,7 +23,6 @@ from nccs_pose.calibration.adjustment import adjust, ArrowSystem, Problem
 from nccs_pose.calibration.frames import choose, frame_information
 from nccs_pose.calibration.gauge import gauges, pose_uncertainty, weak_directions
 from nccs_pose.calibration.judgement import frame_residual
-from nccs_pose.calibration.monitor import CalibrationMonitor, Condition
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import left_jacobian, RigModel, RigParameters
@@ -364,6 +363,24 @@ def noisy(rig, pose, rng, stamp=0, sigma=0.2):
     return replace(frame, points=replace(frame.points, pixels=pixels))
 
 
+def test_a_line_that_is_not_where_the_map_says_widens_the_deviations_or_spoils_the_verdict():
+    rng, true = np.random.default_rng(3), RIGS['arena']
+    frames, _ = measured_frames(true, LINES, 25, rng)
+    rough = disturbed(true, rng)
+    shift, found = np.array([1.0, 0.5, 0.0]), {}
+    for metres in (0.0, 0.03, 0.1):
+        lines = list(LINES)
+        lines[1] = replace(
+            lines[1], start=lines[1].start + metres * shift, end=lines[1].end + metres * shift)
+        found[metres] = calibrate(rough, LineMap(tuple(lines)), frames)
+    assert found[0.0].good
+    assert found[0.0].adjustment.shared == 1.0
+    assert 'share errors' in found[0.03].verdict
+    assert found[0.03].uncertainty.position > 5.0 * found[0.0].uncertainty.position
+    assert not found[0.1].good
+    assert 'a line of the map' in found[0.1].verdict
+
+
 def test_bad_input_is_refused_in_words():
     rng, rig = np.random.default_rng(1), RIGS['parabolic']
     frames, _ = measured_frames(rig, LINES, 12, rng, points=30)
@@ -416,44 +433,6 @@ def test_the_pose_error_of_an_uncertain_rig_is_that_of_sampled_rigs():
     assert told.position == pytest.approx(
         np.sqrt(np.mean(rest[:, 0] ** 2 + rest[:, 1] ** 2)), rel=0.1)
     assert told.base_position == pytest.approx(np.hypot(*errors.mean(axis=0)[:2]), rel=0.2)
-
-
-def drive_past(monitor, used, true, rng, frames=25):
-    for number in range(frames):
-        pose = Pose2(*rng.uniform([-1.0, -0.7, -3.0], [1.0, 0.7, 3.0]))
-        frame = noisy(true, pose, rng, number)
-        found = frame_residual(RigModel(used, LINES), frame, pose.as_array())[0]
-        if np.isfinite(found).all():
-            monitor.add_frame(frame, Pose2.from_array(found))
-
-
-def test_the_monitor_is_silent_under_a_true_rig_and_unsure_at_first():
-    for name, rig in RIGS.items():
-        monitor = CalibrationMonitor(rig, LINES)
-        assert monitor.verdict().condition is Condition.UNKNOWN
-        drive_past(monitor, rig, rig, np.random.default_rng(3))
-        verdict = monitor.verdict()
-        assert verdict.condition is Condition.GOOD, name
-        assert verdict.statistic < verdict.limit, name
-        assert verdict.pose_error < 2e-3
-        monitor.reset()
-        assert monitor.verdict().condition is Condition.UNKNOWN
-
-
-def test_the_monitor_says_what_moved_and_by_how_much():
-    rig = RIGS['arena']
-    moved = replace(rig, cop=rig.cop + np.array([0.0, 0.2e-3, 0.2236e-3]))
-    monitor = CalibrationMonitor(rig, LINES)
-    drive_past(monitor, rig, moved, np.random.default_rng(3))
-    verdict = monitor.verdict()
-    assert verdict.condition is Condition.SUSPECT
-    assert 'the mirror moved by about 0.3' in verdict.words
-    assert verdict.pose_error > 0.01
-    turned = replace(
-        rig, R_mirror_camera=rotation_exp([np.deg2rad(0.2), 0.0, 0.0]) @ rig.R_mirror_camera)
-    monitor.reset()
-    drive_past(monitor, rig, turned, np.random.default_rng(3))
-    assert 'the camera turned by about 0.2' in monitor.verdict().words
 
 
 def test_cells_average_what_falls_into_them():

@@ -75,7 +75,7 @@ def test_an_outline_of_something_else_is_refused():
         rig = rimmed(name, radius)
         outline = outline_points(rig)
         middle = outline.mean(axis=0)
-        with pytest.raises(CalibrationError, match="puts the mirror .* not the mirror's outline"):
+        with pytest.raises(CalibrationError, match=r"puts the mirror .* not the mirror's outline"):
             rig_from_outline(rig, middle + 0.7 * (outline - middle))
 
 

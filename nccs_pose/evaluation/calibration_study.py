@@ -172,7 +172,9 @@ def squared_errors(
     return float(np.sum(values[seen] * along**2)), int(seen.sum())
 
 
-def targets(kinds: Sequence[str], rigs: int, mounting: bool = True) -> None:
+def targets(
+    kinds: Sequence[str], rigs: int, first: int = 0, mounting: bool = True,
+) -> None:
     """20 frames x 4 lines x 75 px at 0.2 px, each number 0.3 mm or 0.3 degrees off at first.
 
     :param mounting: whether height and tilt are free as well as the camera against the mirror.
@@ -181,7 +183,7 @@ def targets(kinds: Sequence[str], rigs: int, mounting: bool = True) -> None:
     options = CalibrationOptions(height=mounting, tilt=mounting)
     for kind in kinds:
         before, after, cop, seconds, total, freedom = [], [], [], [], 0.0, 0
-        for seed in range(rigs):
+        for seed in range(first, first + rigs):
             rng = np.random.default_rng(seed)
             true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
             rough = off_in_each(true, rng)
@@ -269,12 +271,12 @@ def main() -> None:
     parser.add_argument('--rigs', type=int, default=50)
     parser.add_argument(
         '--hold-mounting', action='store_true', help='hold height and tilt, of targets')
-    parser.add_argument('--first', type=int, default=0, help='first seed, of rough')
+    parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--kind', action='append', help='arena, or a rig of Table I; repeatable')
     arguments = parser.parse_args()
     if arguments.study == 'targets':
         targets(arguments.kind or ['arena', *TABLE_ONE], arguments.rigs,
-                not arguments.hold_mounting)
+                arguments.first, not arguments.hold_mounting)
     elif arguments.study == 'rough':
         rough_starts(arguments.kind or list(TABLE_ONE), arguments.rigs, arguments.first)
     else:
