@@ -47,6 +47,10 @@ ALIGNED = 1e-9
 # of their rounding.
 _ON_CIRCLE = 1e-4
 _YAWS = 2.0 * math.pi * np.arange(16) / 16
+# From samples at those yaws to Fourier coefficients, -6 to 6, and to the samples' derivatives.
+_FOURIER = np.exp(-1j * np.arange(-6, 7)[:, None] * _YAWS) / 16
+_DERIVATIVE = (np.exp(1j * _YAWS[:, None] * np.arange(-6, 7)) @ (
+    1j * np.arange(-6, 7)[:, None] * _FOURIER)).real
 
 
 def _parametrisation(yaws: Array) -> Array:
@@ -59,8 +63,15 @@ def _parametrisation(yaws: Array) -> Array:
     return v
 
 
-_SAMPLES = _parametrisation(_YAWS)
-_SAMPLES_T = np.ascontiguousarray(np.swapaxes(_SAMPLES, 1, 2))
+def _entries_of_q() -> Array:
+    """Q_00, Q_11, Q_22, Q_01, Q_02, Q_12 at the sampled yaws, from the entries of G (96, 49)."""
+    v = _parametrisation(_YAWS)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    return np.concatenate([
+        np.einsum('ka,kb->kab', v[:, :, i], v[:, :, j]).reshape(16, 49) for i, j in pairs])
+
+
+_SAMPLES = _entries_of_q()
 
 
 def general_minima(gram: Array) -> tuple[Minimum, ...]:
@@ -68,23 +79,15 @@ def general_minima(gram: Array) -> tuple[Minimum, ...]:
 
     :param gram: Gram matrix of S (7, 7).
     """
-    q = _SAMPLES_T @ gram @ _SAMPLES
-    minor = q[:, 0, 0] * q[:, 1, 1] - q[:, 0, 1] ** 2
-    full = (
-        minor * q[:, 2, 2]
-        - q[:, 0, 0] * q[:, 1, 2] ** 2 - q[:, 1, 1] * q[:, 0, 2] ** 2
-        + 2.0 * q[:, 0, 1] * q[:, 0, 2] * q[:, 1, 2])
-    # Fourier coefficients from -degree to degree; the rest is zero but for rounding.
-    n = np.fft.fft(full)[np.arange(-4, 5)]
-    d = np.fft.fft(minor)[np.arange(-2, 3)]
-    slope = (np.convolve(1j * np.arange(-4, 5) * n, d) - np.convolve(n, 1j * np.arange(-2, 3) * d))
-    yaws = _minima_of_slope(slope)
-    minima = [_minimum_at(gram, yaw) for yaw in yaws.tolist()]
-    if not minima:
+    q00, q11, q22, q01, q02, q12 = (_SAMPLES @ gram.ravel()).reshape(6, 16)
+    minor = q00 * q11 - q01 * q01
+    full = minor * q22 - q00 * q12 * q12 - q11 * q02 * q02 + 2.0 * q01 * q02 * q12
+    slope = (_DERIVATIVE @ full) * minor - full * (_DERIVATIVE @ minor)
+    yaws = _minima_of_slope(_FOURIER @ slope)
+    if not len(yaws):
         # Flat up to rounding: any yaw is as good.
-        minima = [_minimum_at(gram, yaw) for yaw in _YAWS.tolist()]
-        return (min(minima, key=lambda m: m.cost),)
-    return tuple(sorted(minima, key=lambda m: m.cost))
+        return _minima_at(gram, _YAWS)[:1]
+    return _minima_at(gram, yaws)
 
 
 def _minima_of_slope(slope: NDArray[np.complex128]) -> Array:
@@ -107,12 +110,16 @@ def _minima_of_slope(slope: NDArray[np.complex128]) -> Array:
     return yaws[curvature > 0.0]
 
 
-def _minimum_at(gram: Array, yaw: float) -> Minimum:
-    """The best translation for a yaw."""
-    v = _parametrisation(np.array([yaw]))[0]
-    q = v.T @ gram @ v
-    x, y = (-inverse_2x2(q[:2, :2]) @ q[:2, 2]).tolist()
-    return Minimum(Pose2(x, y, yaw), float(np.array([x, y, 1.0]) @ q @ (x, y, 1.0)))
+def _minima_at(gram: Array, yaws: Array) -> tuple[Minimum, ...]:
+    """The best translation for each yaw (K,), the best of all first."""
+    v = _parametrisation(yaws)
+    q = np.swapaxes(v, 1, 2) @ gram @ v
+    minima = []
+    for yaw, form in zip(yaws.tolist(), q):
+        x, y = (-inverse_2x2(form[:2, :2]) @ form[:2, 2]).tolist()
+        place = np.array([x, y, 1.0])
+        minima.append(Minimum(Pose2(x, y, yaw), float(place @ form @ place)))
+    return tuple(sorted(minima, key=lambda m: m.cost))
 
 
 def all_minima(gram: Array, directions: Array) -> tuple[Minimum, ...]:

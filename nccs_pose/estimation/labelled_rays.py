@@ -77,11 +77,14 @@ class LabelledRays:
         _check_finite('ray moments', rays.moment)
         _check_finite('derivatives of ray directions', rays.direction_jacobian)
         _check_finite('derivatives of ray moments', rays.moment_jacobian)
-        used, self.index = np.unique(label[use], return_inverse=True)
+        label = label[use]
+        used = np.zeros(len(directions), dtype=bool)
+        used[label] = True
+        self.index = (np.cumsum(used) - 1)[label]
         self.directions = directions[used]
         self.origin = feet_in_plan(self.directions, moments[used]).mean(axis=0)
         self.moments = moments_about(self.origin, self.directions, moments[used])
-        self.sigma2 = np.broadcast_to(sigma, label.shape)[use] ** 2
+        self.sigma2 = (sigma[use] if sigma.ndim else np.full(len(label), sigma)) ** 2
         self._sigma2_world = sigma_world**2
 
     def __len__(self) -> int:

@@ -175,7 +175,8 @@ def _vague(size: int) -> Array:
 
 def _robust_scale(e: Array) -> float:
     """Standard deviation of the bulk of whitened residuals, never below the noise told."""
-    return max(1.0, 1.4826 * float(np.median(np.abs(e))))
+    middle = [(len(e) - 1) // 2, len(e) // 2]
+    return max(1.0, 1.4826 * float(np.partition(np.abs(e), middle)[middle].mean()))
 
 
 def _descend(

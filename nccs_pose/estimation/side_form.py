@@ -57,7 +57,9 @@ class SideForm:
         if sigma_world > 0.0:
             ray.append(np.zeros_like(r))
             moment.append(r)
-        self._rows = monomial_rows(np.array(ray), np.array(moment), directions, moments)
+        rows = monomial_rows(np.array(ray), np.array(moment), directions, moments)
+        # by monomial (7, K, N): what belongs to one pixel lies apart, and vectors in one piece
+        self._rows = np.ascontiguousarray(np.moveaxis(rows, 2, 0))
         self._variance = np.square(sigma)
         self._world_variance = sigma_world**2
         self._with_attitude = with_attitude
@@ -70,35 +72,38 @@ class SideForm:
 
         :param unknowns: (x, y, yaw), followed by (z, roll, pitch) with the attitude.
         """
-        pose = Pose2(*unknowns[:3])
-        values = self._rows @ np.column_stack([monomials(pose), monomials_jacobian(pose)])
-        s, gradient = values[0], values[1:3]
-        variance = self._variance * np.square(gradient[:, :, 0]).sum(axis=0)
-        half_slope = self._variance[:, None] * np.einsum(
-            'kn,knp->np', gradient[:, :, 0], gradient[:, :, 1:])
+        pose = Pose2(*unknowns[:3].tolist())
+        form = np.vstack([monomials(pose), monomials_jacobian(pose).T])
+        values = (form @ self._rows.reshape(7, -1)).reshape(4, *self._rows.shape[1:])
+        s, s_pose = values[0, 0], values[1:, 0]
+        g_u, g_v = values[0, 1], values[0, 2]
+        variance = self._variance * (g_u * g_u + g_v * g_v)
+        half_slope = self._variance * (values[1:, 1] * g_u + values[1:, 2] * g_v)
         if self._world_variance > 0.0:
-            cosine = values[-1]
-            variance = variance + self._world_variance * (1.0 - np.square(cosine[:, 0]))
-            half_slope -= self._world_variance * cosine[:, :1] * cosine[:, 1:]
+            cosine = values[0, -1]
+            variance = variance + self._world_variance * (1.0 - cosine * cosine)
+            half_slope = half_slope - self._world_variance * cosine * values[1:, -1]
         # A ray along the line, or a pixel where nothing changes, has no distance to tell.
         variance = np.maximum(variance, 1e-30)
         scale = 1.0 / np.sqrt(variance)
-        by_attitude = values[3:6, :, 0].T if self._with_attitude else np.zeros((len(scale), 0))
-        numerator = s[:, 0] + by_attitude @ unknowns[3:]
-        jacobian = np.concatenate(
-            [s[:, 1:] - (numerator / variance)[:, None] * half_slope, by_attitude], axis=1)
-        return numerator * scale, scale[:, None] * jacobian
+        if self._with_attitude:
+            s = s + unknowns[3:] @ values[0, 3:6]
+        jacobian = scale * (s_pose - s / variance * half_slope)
+        if self._with_attitude:
+            jacobian = np.vstack([jacobian, scale * values[0, 3:6]])
+        return s * scale, jacobian.T
 
     def image_shift(self, unknowns: Array) -> Array:
         """de/d(u, v) (N, 2): what a shift of the whole image does to the residuals."""
-        gradient = (self._rows[1:3] @ monomials(Pose2(*unknowns[:3]))).T
-        variance = self._variance * np.square(gradient).sum(axis=1)
-        return gradient / np.sqrt(np.maximum(variance, 1e-30))[:, None]
+        form = monomials(Pose2(*unknowns[:3].tolist()))
+        g_u, g_v = form @ self._rows[:, 1], form @ self._rows[:, 2]
+        variance = self._variance * (g_u * g_u + g_v * g_v)
+        return (np.stack([g_u, g_v]) / np.sqrt(np.maximum(variance, 1e-30))).T
 
     def of(self, chosen: Array) -> SideForm:
         """The same for some of the pixels."""
         part = object.__new__(SideForm)
         part.__dict__.update(self.__dict__)
-        part._rows = self._rows[:, chosen]
+        part._rows = np.ascontiguousarray(self._rows[:, :, chosen])
         part._variance = self._variance[chosen]
         return part

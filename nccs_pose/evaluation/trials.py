@@ -29,8 +29,8 @@ import math
 from nccs_pose.errors import EstimationError, SimulationError
 from nccs_pose.estimation.bound import cramer_rao_bound
 from nccs_pose.estimation.global_pose import solve
+from nccs_pose.estimation.image_refine import refine_in_image
 from nccs_pose.estimation.paper import paper_estimate
-from nccs_pose.estimation.refine import refine
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.geometry.rig import Rig
@@ -155,15 +155,15 @@ def run_trial(options: ExperimentOptions, cell: Cell, trial: int) -> tuple[Answe
 
 
 def our_estimate(rig: Rig, data: DataSet, cell: Cell) -> Pose2 | None:
-    """Closed form without a start, then the robust refinement in pixels."""
+    """Closed form without a start, then the robust refinement in the image."""
     rays = rig.back_project(data.pixels)
     sigma, world = cell.sigma_px or _NO_NOISE_PX, cell.sigma_world
     try:
         found = solve(
             rays, data.directions, data.moments, data.label, sigma=sigma, sigma_world=world)
-        return refine(
-            rays, data.directions[data.label], data.moments[data.label], found[0].pose,
-            sigma=sigma, sigma_world=world).pose
+        return refine_in_image(
+            rig, data.pixels, data.directions[data.label], data.moments[data.label],
+            found[0].pose, sigma=sigma, sigma_world=world).pose
     except EstimationError:
         return None
 
