@@ -22,7 +22,7 @@ import cv2
 from hypothesis import given
 from hypothesis import strategies as st
 from nccs_pose.errors import VisionError
-from nccs_pose.estimation.prediction import predict_bands
+from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.renderer import render
@@ -200,6 +200,11 @@ def test_a_search_of_noise_finds_next_to_nothing() -> None:
 POSE = Pose2(0.3, -0.2, 0.6)
 
 
+def _predict(table: FloorTable, scene: Scene, pose: Pose2) -> tuple[Bands, np.ndarray]:
+    predictor = BandPredictor(table, scene.line_map)
+    return predictor.bands(predictor.places(pose, 8.0, 75), pose)
+
+
 def _beside(scene: Scene, bands: Bands, shift: np.ndarray, pose: Pose2) -> np.ndarray:
     """How far the measured pixels lie from their tapes' midlines, px (N,).
 
@@ -224,8 +229,7 @@ def test_rendered_tapes_are_measured_where_they_are(moved: tuple[float, float, f
     scene = ideal_scene(640, noise=0.0)
     image = render(scene, POSE, np.random.default_rng(0))
     table = FloorTable(scene.rig, 5.0)
-    bands = predict_bands(
-        table, scene.line_map, Pose2.from_array(POSE.as_array() + moved), 75)
+    bands, _ = _predict(table, scene, Pose2.from_array(POSE.as_array() + moved))
     fit, _ = fit_profiles(image, bands, _colour())
     assert fit.found.mean() > 0.95
     error = _beside(scene, bands, fit.shift, POSE)[fit.found]
@@ -241,7 +245,7 @@ def test_rendered_tapes_are_measured_where_they_are(moved: tuple[float, float, f
 def test_bands_lie_on_the_exact_images_of_their_tapes() -> None:
     scene = ideal_scene(640)
     table = FloorTable(scene.rig, 5.0)
-    bands = predict_bands(table, scene.line_map, POSE, 75)
+    bands, _ = _predict(table, scene, POSE)
     assert set(bands.label.tolist()) == {0, 1, 2, 3}
     assert np.abs(_beside(scene, bands, np.zeros(len(bands)), POSE)).max() < 0.01
     # The ends of the cuts lie on the tape's edges, half its width from the midline.
@@ -284,7 +288,8 @@ def _stations(contrast: np.ndarray, n: int = 60) -> tuple[np.ndarray, ...]:
     shade = rng.standard_normal((n, 8, 1)) * np.array([3.0, 4.0, 5.0])
     floor = shade + 0.5 * rng.standard_normal((n, 8, 3))
     return (
-        contrast + rng.standard_normal((n, 3)), np.ones(n), floor, np.ones((n, 8)))
+        contrast + rng.standard_normal((n, 3)), np.ones(n), floor.astype(np.float32),
+        np.ones((n, 8), np.float32), FLOOR)
 
 
 def test_the_contrast_and_the_floors_variation_are_learned() -> None:
@@ -317,8 +322,8 @@ def test_no_lesson_makes_a_colour_useless(seed: int) -> None:
     for _ in range(3):
         colour = colour.learn(
             scale * rng.standard_normal((30, 3)), rng.random(30),
-            scale * rng.standard_normal((30, 5, 3)),
-            (rng.random((30, 5)) > 0.3).astype(float))
+            (scale * rng.standard_normal((30, 5, 3))).astype(np.float32),
+            (rng.random((30, 5)) > 0.3).astype(np.float32), 200.0 * rng.random(3))
         assert np.isfinite(colour.discriminant).all()
         assert colour.discriminant @ colour.contrast == pytest.approx(1.0)
 
@@ -441,7 +446,7 @@ def test_tapes_of_a_furnished_room_are_in_the_mask() -> None:
     image = render(scene, POSE, np.random.default_rng(1))
     table = FloorTable(scene.rig, 3.0)
     mask = _mask(image)
-    bands = predict_bands(table, scene.line_map, POSE, 75)
+    bands, _ = _predict(table, scene, POSE)
     wide = bands[bands.half_width > 0.4]
     assert len(wide) > 60
     u, v = np.rint(wide.centre).astype(int).T

@@ -17,11 +17,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
-from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.prediction import predict_bands
-from nccs_pose.estimation.refine import refine, Refinement
+from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.shift_solve import solve_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
@@ -32,22 +33,36 @@ from nccs_pose.vision.profiles import fit_profiles, ProfileFit, search_profiles
 import numpy as np
 from numpy.typing import NDArray
 
+# Stations stand this far apart in the image and average all of it, px.
+_SPACING = 16.0
+# A first, rough pass takes one station of so many; a search, so many of each line.
+_ROUGH = 2
+_SEARCHED = 25
 # A profile is linear in its shift for about so many pixels.
 _LINEAR_PX = 2.0
 _ITERATIONS = 8
-# A measured shift is right to a fifth or better: the poses have settled when the last step was
-# below one standard deviation of what was measured.
-_SETTLED = 1.0
+# The poses have settled when the last step moved no station by more than this share of the blur (a
+# shift so small is measured right to two hundredths), or when it was below half a standard
+# deviation.
+_SETTLED_BLURS = 0.3
+_SETTLED = 0.5
+# Nor does a pass count that has just learned a blur so different, px: a template too soft or too
+# sharp takes a step for larger or smaller than it is.
+_LEARNED_BLUR = 0.1
+# After a step larger than this the stations are chosen anew, px.
+_MOVED_PX = 3.0
 # What still steps at the end, by less than this (m and rad), is uncertain by that much more.
 _LAST_STEP = 0.005
 _LEAST_STATIONS = 12
-# A line of so many stations, so wide in the image (px), of which less than this fraction is
-# found, is missing.
-_PLAIN_STATIONS = 15
+# A line of so many pixels of curve, so wide in the image (px), of which less than this fraction
+# is found, is missing.
+_PLAIN_LENGTH = 60.0
 _PLAIN_WIDTH = 1.0
 _MISSING = 0.25
-# Neighbours that may share one cause of error (a shade, a tile, a block of JPEG).
-_BLOCK = 12
+# Neighbours that may share one cause of error: a block of JPEG or a tile, a shade, half a line. A
+# share counts that chance makes once in so many standard deviations.
+_BLOCKS = (4, 12)
+_CHANCE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +94,24 @@ class Alignment:
     colours: tuple[LineColour, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """One pass: what the stations say, and the pose that follows."""
+
+    refinement: Refinement
+    bands: Bands
+    fit: ProfileFit
+    used: NDArray[np.bool_]
+    moved: float
+    colours: tuple[LineColour, ...]
+
+
 class Aligner:
     """Lays poses on images for one rig and map."""
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
-        self._table = table
-        self._map = line_map
+        self._predictor = BandPredictor(table, line_map)
+        self._lines = len(line_map)
         self._options = options
         names = tuple(dict.fromkeys(line.colour for line in line_map))
         self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
@@ -114,35 +141,42 @@ class Aligner:
             if searched is None:
                 return None
             pose = searched
+        places = self._predictor.places(pose, _SPACING, self._options.stations)
+        if len(places) < _LEAST_STATIONS:
+            return None
+        if len(places) >= _ROUGH * _LEAST_STATIONS:
+            rough = self._measure(image, places.every(_ROUGH), pose, prior, colours, rough=True)
+            pose = pose if rough is None else rough.refinement.pose
         result: Alignment | None = None
         for _ in range(_ITERATIONS):
-            bands = self._bands(pose)
-            if len(bands) < _LEAST_STATIONS:
+            measured = self._measure(image, places, pose, prior, colours, rough=False)
+            if measured is None:
                 return None
-            fit, colours = self._fit(image, bands, colours)
-            result = self._solve(bands, fit, pose, prior, colours)
-            if result is None:
-                return None
+            known, colours = colours, measured.colours
+            result = _alignment(measured, self._lines)
             step = result.pose.as_array() - pose.as_array()
             step[2] = wrap_angle(step[2])
-            settled = close(result.pose, pose, result.covariance, _SETTLED)
+            sharpest = min(colour.blur for colour in colours)
+            learned = max(abs(a.blur - b.blur) for a, b in zip(known, colours))
+            settled = learned < _LEARNED_BLUR and (
+                measured.moved < _SETTLED_BLURS * sharpest or close(
+                    result.pose, pose, result.covariance, _SETTLED))
             pose = result.pose
             if settled:
                 return result
+            if measured.moved > _MOVED_PX:
+                places = self._predictor.places(pose, _SPACING, self._options.stations)
         if result is None or np.abs(step).max() > _LAST_STEP:
             return None
         # Stations that come and go near their thresholds can keep it stepping to and fro.
         return replace(result, covariance=result.covariance + np.outer(step, step))
 
-    def _bands(self, pose: Pose2) -> Bands:
-        return predict_bands(self._table, self._map, pose, self._options.stations)
-
     def _fit(
-        self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...],
+        self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...], rough: bool,
     ) -> tuple[ProfileFit, tuple[LineColour, ...]]:
         """Fit the bands of each colour with that colour."""
         if len(colours) == 1:
-            fit, learned = fit_profiles(image, bands, colours[0])
+            fit, learned = fit_profiles(image, bands, colours[0], rough=rough)
             return fit, (learned,)
         n = len(bands)
         shift, sigma, contrast = np.zeros(n), np.ones(n), np.zeros(n)
@@ -151,7 +185,8 @@ class Aligner:
         for k, colour in enumerate(colours):
             own = self._colour_of_line[bands.label] == k
             if own.any():
-                fit, learned_all[k] = fit_profiles(image, bands[own], colour)
+                fit, learned_all[k] = fit_profiles(
+                    image, bands[own], colour, rough=rough)
                 shift[own], sigma[own], contrast[own] = fit.shift, fit.sigma, fit.contrast
                 found[own] = fit.found
         return ProfileFit(shift, sigma, contrast, found), tuple(learned_all)
@@ -160,84 +195,81 @@ class Aligner:
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
         reach: float, prior: tuple[Pose2, Array] | None,
     ) -> Pose2 | None:
-        bands = self._bands(start)
-        pixels, labels = [], []
+        places = self._predictor.places(start, _SPACING / 2.0, _SEARCHED)
+        bands, slide = self._predictor.bands(places, start)
+        shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
         for k, colour in enumerate(colours):
-            own = bands[self._colour_of_line[bands.label] == k]
-            if len(own) < _LEAST_STATIONS:
-                continue
-            fit = search_profiles(image, own, colour, reach)
-            moved = own.midline + fit.shift[:, None] * own.across
-            pixels.append(moved[fit.found])
-            labels.append(own.label[fit.found])
-        if sum(len(label) for label in labels) < _LEAST_STATIONS:
+            own = self._colour_of_line[bands.label] == k
+            if own.sum() >= _LEAST_STATIONS:
+                fit = search_profiles(image, bands[own], colour, reach)
+                shift[own], found[own] = fit.shift, fit.found
+        if found.sum() < _LEAST_STATIONS:
             return None
-        found = self._refined(
-            np.concatenate(pixels), np.ones(sum(map(len, labels))), np.concatenate(labels),
-            start, prior)
-        return None if found is None else found[0].pose
+        return self._solved(
+            shift[found], np.ones(int(found.sum())), slide[found], bands[found], start,
+            prior).pose
 
-    def _refined(
-        self, pixels: Array, sigma: Array, label: NDArray[np.intp], start: Pose2,
+    def _solved(
+        self, shift: Array, sigma: Array, slide: Array, bands: Bands, start: Pose2,
         prior: tuple[Pose2, Array] | None,
-    ) -> tuple[Refinement, NDArray[np.bool_]] | None:
-        """Refine on pixels; returns the solve and which pixels it used, or None."""
-        rays = self._table.rig.back_project(pixels)
-        hit = rays.hit
-        try:
-            return refine(
-                rays[hit], self._map.directions[label[hit]], self._map.moments[label[hit]],
-                start, sigma=sigma[hit], prior=prior, noise_known=False,
-                calibration_sigma=self._options.calibration_sigma,
-                attitude_sigma=(self._options.height_sigma, self._options.tilt_sigma)), hit
-        except EstimationError:
-            return None
+    ) -> Refinement:
+        options = self._options
+        return solve_shifts(
+            shift, sigma, slide, start, prior=prior,
+            attitude_sigma=(options.height_sigma, options.tilt_sigma),
+            image_shift=bands.across, calibration_sigma=options.calibration_sigma)
 
-    def _solve(
-        self, bands: Bands, fit: ProfileFit, start: Pose2,
-        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...],
-    ) -> Alignment | None:
+    def _measure(
+        self, image: NDArray[np.uint8], places: Places, start: Pose2,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], *, rough: bool,
+    ) -> _Measured | None:
+        """Measure stations where a pose predicts them, and solve; None with too few of them."""
+        bands, slide = self._predictor.bands(places, start)
+        if len(bands) < _LEAST_STATIONS:
+            return None
+        fit, colours = self._fit(image, bands, colours, rough)
         used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
         if used.sum() < _LEAST_STATIONS:
             return None
-        pixels = (bands.midline + fit.shift[:, None] * bands.across)[used]
-        label = bands.label[used]
-        solved = self._refined(pixels, fit.sigma[used], label, start, prior)
-        if solved is None:
-            return None
-        refinement, hit = solved
-        index = np.flatnonzero(used)[hit][refinement.inlier]
-        # A tape half a pixel wide shows half the contrast, and is missed half as badly.
-        worth = bands.spacing * np.minimum(1.0, bands.half_width)
-        scale = float(np.sqrt(np.mean(refinement.residual[refinement.inlier] ** 2)))
-        points = LinePoints(
-            pixels[hit][refinement.inlier], scale * fit.sigma[index], bands.label[index])
-        residual = refinement.residual[refinement.inlier]
-        correlation, misfit = _common_errors(residual, points.sigma / scale, points.label)
-        return Alignment(
-            refinement.pose, correlation * refinement.covariance, refinement, points,
-            float(worth[index].sum() / worth.sum()),
-            tuple(int(k) for k in np.unique(points.label)), _missing(bands, index),
-            _support(bands, index, len(self._map)), misfit, colours)
+        refinement = self._solved(
+            fit.shift[used], fit.sigma[used], slide[used], bands[used], start, prior)
+        step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
+                         float(wrap_angle(refinement.pose.yaw - start.yaw))])
+        moved = float(np.abs(slide[:, :3] @ step).max())
+        return _Measured(refinement, bands, fit, used, moved, colours)
+
+
+def _alignment(measured: _Measured, lines: int) -> Alignment:
+    """What a last pass over a map of so many lines comes to."""
+    bands, fit, refinement = measured.bands, measured.fit, measured.refinement
+    index = np.flatnonzero(measured.used)[refinement.inlier]
+    # A tape half a pixel wide shows half the contrast, and is missed half as badly.
+    worth = bands.spacing * np.minimum(1.0, bands.half_width)
+    residual = refinement.residual[refinement.inlier]
+    sigma, label = fit.sigma[index], bands.label[index]
+    scale = float(np.sqrt(np.mean(residual**2)))
+    pixels = bands.midline[index] + fit.shift[index, None] * bands.across[index]
+    correlation, misfit = _common_errors(residual, sigma, label)
+    return Alignment(
+        refinement.pose, correlation * refinement.covariance, refinement,
+        LinePoints(pixels, scale * sigma, label), float(worth[index].sum() / worth.sum()),
+        tuple(np.unique(label).tolist()), _missing(bands, index),
+        _support(bands, index, lines), misfit, measured.colours)
 
 
 def _support(bands: Bands, found: NDArray[np.intp], lines: int) -> Array:
-    """Fraction of each line's stations that were found (L,), NaN where it has none."""
-    predicted = np.bincount(bands.label, minlength=lines)
-    rests = np.bincount(bands.label[found], minlength=lines)
-    return np.where(predicted > 0, rests / np.maximum(predicted, 1), np.nan)
+    """Fraction of each line's predicted stations that were found (L,); NaN out of view."""
+    seen = np.bincount(bands.label, minlength=lines)
+    there = np.bincount(bands.label[found], minlength=lines)
+    return np.where(seen > 0, there / np.maximum(seen, 1), np.nan)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
     """Lines that should be seen plainly, of which next to nothing is among the found stations."""
-    missing = []
-    for k in np.unique(bands.label):
-        own = bands.label == k
-        plain = own.sum() >= _PLAIN_STATIONS and np.median(
-            2.0 * bands.half_width[own]) >= _PLAIN_WIDTH
-        if plain and own[found].sum() < _MISSING * own.sum():
-            missing.append(int(k))
-    return tuple(missing)
+    plain = bands.spacing * (2.0 * bands.half_width >= _PLAIN_WIDTH)
+    seen = np.bincount(bands.label, plain)
+    there = np.bincount(bands.label[found], plain[found], minlength=len(seen))
+    return tuple(np.flatnonzero((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).tolist())
 
 
 def _common_errors(
@@ -247,25 +279,34 @@ def _common_errors(
 
     :param residual: whitened residuals (N,), along each line in order.
     :param sigma: their scale (N,), px.
-    :param label: line (N,).
+    :param label: line (N,), ascending.
     :returns: the variance of sums over blocks of neighbours against that of independent ones (1
         for white noise, up to the block's size where whole stretches err together), and the root
         mean square of the blocks' means beyond noise, px.
     """
-    blocks = [own[first:first + _BLOCK] for own in
-              (np.flatnonzero(label == k) for k in np.unique(label))
-              for first in range(0, len(own) - _BLOCK + 1, _BLOCK)]
-    if not blocks:
-        return 1.0, 0.0
-    e = residual[np.array(blocks)]
-    off = (e * sigma[np.array(blocks)]).mean(axis=1)
-    noise = np.mean(np.square(sigma * residual)) / _BLOCK
-    misfit = float(np.sqrt(max(0.0, np.mean(np.square(off)) - noise)))
-    if len(blocks) < 6:
-        return 1.0, misfit
-    # The fit has taken three degrees of freedom out of the blocks.
-    per_residual = np.mean(np.square(e.sum(axis=1))) / _BLOCK * len(blocks) / (len(blocks) - 3)
-    return float(max(1.0, per_residual / max(np.mean(residual**2), 1e-12))), misfit
+    factor, misfit = 1.0, 0.0
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(label)) + 1, [len(label)]])
+    variance = max(float(np.mean(residual**2)), 1e-12)
+    for size in _BLOCKS:
+        first = np.concatenate([
+            np.arange(start, end - size + 1, size)
+            for start, end in pairwise(edges.tolist())])
+        if not len(first):
+            continue
+        block = first[:, None] + np.arange(size)
+        e = residual[block]
+        in_px = e * sigma[block]
+        common = float(np.mean(np.square(in_px.mean(axis=1))))
+        noise = float(np.mean(np.square(in_px))) / size
+        misfit = max(misfit, float(np.sqrt(max(0.0, common - noise))))
+        # The fit has taken three degrees of freedom out of the blocks.
+        degrees = len(first) - 3
+        if degrees < 3:
+            continue
+        together = float(np.square(e.sum(axis=1)).sum()) / (size * degrees * variance)
+        if together > 1.0 + _CHANCE * np.sqrt(2.0 / degrees):
+            factor = max(factor, together)
+    return factor, misfit
 
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:

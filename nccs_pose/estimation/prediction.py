@@ -12,9 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where a pose says that the tapes of the map are seen."""
+"""Where a pose says that the tapes of the map are seen, and how they move with the pose."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -24,85 +26,147 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Coarse samples of each line, between which its image's length is interpolated.
-_COARSE = 40
-# Stations closer than this share pixels and tell nothing new, px.
-_CLOSEST = 4.0
+_COARSE = 32
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
+# So many stations at most, on all lines together.
+_MOST = 1500
 
 
-def predict_bands(
-    table: FloorTable, line_map: LineMap, pose: Pose2, stations: int,
-) -> Bands:
-    """Stations evenly spaced in the image along each visible floor tape.
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where on the floor tapes N stations stand.
 
-    :param pose: T_map_base.
-    :param stations: at most so many a line.
+    :ivar number: of the line among the floor tapes (N,).
+    :ivar distance: from the line's start (N,), metres.
+    :ivar spacing: length of curve that the station stands for (N,), px.
     """
-    spots = [_place(table, line_map, k, pose, stations) for k in range(len(line_map))]
-    label = np.concatenate(
-        [np.full(len(spot), k, dtype=np.intp) for k, spot in enumerate(spots)])
-    at = np.concatenate(spots)
-    return _bands(table, line_map, pose, at[:, 0], at[:, 1], label)
+
+    number: NDArray[np.intp]
+    distance: Array
+    spacing: Array
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def every(self, step: int) -> Places:
+        """One out of so many."""
+        return Places(
+            self.number[step // 2::step], self.distance[step // 2::step],
+            self.spacing[step // 2::step])
 
 
-def _place(
-    table: FloorTable, line_map: LineMap, k: int, pose: Pose2, stations: int,
-) -> Array:
-    """Positions along line k (n, 2): distance from its start in metres, and spacing in px."""
-    line = line_map[k]
-    if not (line.width > 0.0 and abs(line.start[2]) < 1e-6):
-        return np.zeros((0, 2))
-    distance = np.linspace(0.0, line.length, _COARSE)
-    points = line.start[:2] + distance[:, None] * line.direction[:2]
-    pixels = table.pixels(pose.inverse().apply(points))
-    step = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
-    visible = table.sees_floor(pixels)
-    step = np.where(visible[1:] & visible[:-1], step, 0.0)
-    arc = np.concatenate([[0.0], np.cumsum(step)])
-    length = arc[-1] - 2.0 * _END
-    if length < _CLOSEST:
-        return np.zeros((0, 2))
-    n = int(min(stations, np.ceil(length / _CLOSEST)))
-    where = _END + (np.arange(n) + 0.5) * (length / n)
-    # arc is flat where the line is hidden; a tiny slope keeps it invertible.
-    rising = arc + 1e-9 * np.arange(_COARSE)
-    return np.column_stack([np.interp(where, rising, distance), np.full(n, length / n)])
+class BandPredictor:
+    """Lays stations along the images of a map's floor tapes, for one rig."""
 
+    def __init__(self, table: FloorTable, line_map: LineMap) -> None:
+        self._table = table
+        self._lines = np.array([
+            k for k, line in enumerate(line_map)
+            if line.width > 0.0 and line.is_horizontal and abs(line.start[2]) < 1e-6],
+            dtype=np.intp)
+        self._start = line_map.starts[self._lines, :2]
+        self._direction = line_map.directions[self._lines, :2]
+        self._length = line_map.lengths[self._lines]
+        self._width = line_map.widths[self._lines]
+        self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
+        self._coarse = (self._start[:, None] + self._distance[..., None]
+                        * self._direction[:, None]).reshape(-1, 2)
 
-def _bands(
-    table: FloorTable, line_map: LineMap, pose: Pose2, distance: Array, spacing: Array,
-    label: NDArray[np.intp],
-) -> Bands:
-    rotation = pose.rotation[:2, :2]
-    direction = line_map.directions[label, :2] @ rotation
-    left = np.column_stack([-direction[:, 1], direction[:, 0]])
-    start = pose.inverse().apply(line_map.starts[:, :2])[label]
-    middle = start + distance[:, None] * direction
-    width = line_map.widths[label]
-    # Image motion per metre along the line and across it, from points a little apart.
-    small = 0.02
-    n = len(label)
-    pixels = table.pixels(np.concatenate([
-        middle, middle + small * direction, middle - small * direction,
-        middle + small * left, middle - small * left]))
-    midline = pixels[:n]
-    ahead = (pixels[n:2 * n] - pixels[2 * n:3 * n]) / (2.0 * small)
-    aside = (pixels[3 * n:4 * n] - pixels[4 * n:]) / (2.0 * small)
-    turn = (pixels[n:2 * n] + pixels[2 * n:3 * n] - 2.0 * midline) / small**2
-    # The cut across the tape whose image is normal to the curve leans along the line.
-    speed2 = np.maximum(np.einsum('ni,ni->n', ahead, ahead), 1e-9)
-    lean = -np.einsum('ni,ni->n', aside, ahead) / speed2
-    cut = 0.5 * width[:, None] * (left + lean[:, None] * direction)
-    edges = table.pixels(np.concatenate([middle + cut, middle - cut]))
-    across = edges[:n] - edges[n:]
-    half_width = 0.5 * np.linalg.norm(across, axis=1)
-    across /= np.maximum(2.0 * half_width, 1e-12)[:, None]
-    along = np.column_stack([across[:, 1], -across[:, 0]])
-    bend = np.einsum('ni,ni->n', turn, across) / speed2
-    # Near its ends the leaning cut would leave the tape.
-    reach = 0.5 * width * np.abs(lean)
-    whole = (distance > reach) & (distance < line_map.lengths[label] - reach)
-    centre = 0.5 * (edges[:n] + edges[n:])
-    keep = whole & table.sees_floor(centre) & (half_width > 1e-3)
-    return Bands(centre, midline, across, along, bend, half_width, spacing, label)[keep]
+    def places(self, pose: Pose2, spacing: float, most: int) -> Places:
+        """Stations evenly spaced in the image along each visible floor tape.
+
+        :param pose: T_map_base.
+        :param spacing: of the stations, px, or more.
+        :param most: at most so many a line.
+        """
+        rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
+        lines = len(self._lines)
+        pixels = self._table.pixels((self._coarse - position) @ rotation)
+        visible = self._table.sees_floor(pixels).reshape(lines, _COARSE)
+        step = np.diff(pixels.reshape(lines, _COARSE, 2), axis=1)
+        arc = np.zeros((lines, _COARSE))
+        np.cumsum(np.sqrt(np.einsum('lci,lci->lc', step, step))
+                  * (visible[:, 1:] & visible[:, :-1]), axis=1, out=arc[:, 1:])
+        length = np.maximum(arc[:, -1] - 2.0 * _END, 0.0)
+        count = np.minimum(min(most, _MOST // max(lines, 1)), length // spacing).astype(int)
+        number = np.repeat(np.arange(lines), count)
+        first = np.cumsum(count) - count
+        spacing_px = (length / np.maximum(count, 1))[number]
+        where = _END + (np.arange(len(number)) - first[number] + 0.5) * spacing_px
+        # All lines one after the other on one axis, so that one interpolation serves them; where
+        # a line is hidden its arc is flat, and a tiny slope keeps it invertible.
+        begin = np.cumsum(arc[:, -1] + 1.0) - arc[:, -1]
+        axis = (arc + 1e-9 * np.arange(_COARSE) + begin[:, None]).ravel()
+        distance = np.interp(where + begin[number], axis, self._distance.ravel())
+        return Places(number, distance, spacing_px)
+
+    def bands(self, places: Places, pose: Pose2) -> tuple[Bands, Array]:
+        """How stations are seen from a pose.
+
+        :param pose: T_map_base, not far from where the stations were chosen.
+        :returns: those that are seen, and d(their place across)/d(x, y, yaw, z, roll, pitch)
+            (N, 6), px per metre and rad; the last three as small motions of the base off its
+            plane.
+        """
+        rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
+        number, distance = places.number, places.distance
+        direction = (self._direction @ rotation)[number]
+        middle = ((self._start - position) @ rotation)[number] + distance[:, None] * direction
+        image = self._table.expand(middle)
+        left = np.empty_like(direction)
+        left[:, 0] = -direction[:, 1]
+        left[:, 1] = direction[:, 0]
+        ahead_of, left_of = image.polar(direction), image.polar(left)
+        ahead, aside = image.slope(ahead_of), image.slope(left_of)
+        # The cut across the tape whose image is normal to the curve leans along the line.
+        speed2 = np.maximum(np.einsum('ni,ni->n', ahead, ahead), 1e-9)
+        lean = -np.einsum('ni,ni->n', aside, ahead) / speed2
+        half = 0.5 * self._width[number]
+        cut_of = half[:, None] * (left_of + lean[:, None] * ahead_of)
+        across = half[:, None] * (aside + lean[:, None] * ahead)
+        half_width = np.maximum(np.sqrt(np.einsum('ni,ni->n', across, across)), 1e-12)
+        across /= half_width[:, None]
+        along = np.empty_like(across)
+        along[:, 0] = across[:, 1]
+        along[:, 1] = -across[:, 0]
+        bend = np.einsum('ni,ni->n', image.curvature(ahead_of), across) / speed2
+        # The two edges lie unequally far from the midline: a matter of the second order.
+        centre = image.pixels + 0.5 * image.curvature(cut_of)
+        # Near its ends the leaning cut would leave the tape.
+        reach = half * np.abs(lean)
+        keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
+                & (distance < self._length[number] - reach))
+        bands = Bands(centre, image.pixels, across, along, bend, half_width, places.spacing,
+                      self._lines[number])
+        slide = self._slide(rotation, middle, image.offset, across, np.stack(
+            [np.einsum('ni,ni->n', image.first[:, k], across) for k in (0, 1)], axis=1),
+            image.outward)
+        if keep.all():
+            return bands, slide
+        return bands[keep], slide[keep]
+
+    def _slide(
+        self, rotation: Array, point: Array, offset: Array, across: Array, by_polar: Array,
+        outward: Array,
+    ) -> Array:
+        """Derivative of the stations' place across by pose and attitude (N, 6).
+
+        :param point: on the floor, in base_link (N, 2).
+        :param offset: from the mirror's foot (N, 2).
+        :param by_polar: derivative of the place across, outward and round (N, 2), px per metre.
+        """
+        out, turned = by_polar[:, 0], by_polar[:, 1]
+        gradient = np.empty_like(across)
+        gradient[:, 0] = out * outward[:, 0] - turned * outward[:, 1]
+        gradient[:, 1] = out * outward[:, 1] + turned * outward[:, 0]
+        slide = np.empty((len(point), 6))
+        # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw.
+        slide[:, :2] = -gradient @ rotation.T
+        slide[:, 2] = gradient[:, 0] * point[:, 1] - gradient[:, 1] * point[:, 0]
+        # Floor that sinks by dz is seen where the ray would have met it: the ray goes outward by
+        # offset / height for every metre that it falls, if the mirror is taken for a point.
+        slide[:, 3] = -np.einsum('ni,ni->n', gradient, offset) / self._table.height
+        slide[:, 4] = slide[:, 3] * point[:, 1]
+        slide[:, 5] = -slide[:, 3] * point[:, 0]
+        return slide

@@ -27,6 +27,7 @@ from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
 import math
+from typing import Any
 
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
@@ -92,7 +93,7 @@ class Covered:
         return 'too careful' if found.mean_nees < found.band[0] else 'true'
 
 
-def _ideal(width: int, noise: float, **sensor: float) -> Callable[[], Scene]:
+def _ideal(width: int, noise: float, **sensor: Any) -> Callable[[], Scene]:
     def scene() -> Scene:
         made = ideal_scene(width, noise)
         return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))
@@ -100,7 +101,7 @@ def _ideal(width: int, noise: float, **sensor: float) -> Callable[[], Scene]:
     return scene
 
 
-def _arena(width: int, **sensor: float) -> Callable[[], Scene]:
+def _arena(width: int, **sensor: Any) -> Callable[[], Scene]:
     def scene() -> Scene:
         made = arena_scene(width)
         return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))

@@ -21,7 +21,7 @@ backward one serves where a pixel's place on the floor need only be known roughl
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 from nccs_pose.errors import GeometryError
@@ -38,6 +38,63 @@ _ANGLES = 64
 _AZIMUTHS = 128
 _PADDING = 8
 _STRIDE = 8
+# Weights of the four coefficients of a cubic spline about a point, for the value and two
+# derivatives, as polynomials in its place t between the second and the third; 1 to t^3 by rows.
+_BASIS = np.array([
+    [1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0],
+    [-1.0, 3.0, -3.0, 1.0]]) / 6.0
+_BASES = np.hstack([
+    _BASIS,
+    np.vstack([_BASIS[1], 2.0 * _BASIS[2], 3.0 * _BASIS[3], np.zeros(4)]),
+    np.vstack([2.0 * _BASIS[2], 6.0 * _BASIS[3], np.zeros((2, 4))])])
+
+
+def _basis(t: Array) -> Array:
+    """Weights of the four coefficients for the value and two derivatives (N, 3, 4)."""
+    powers = np.empty((len(t), 4))
+    powers[:, 0] = 1.0
+    powers[:, 1] = t
+    powers[:, 2] = t * t
+    powers[:, 3] = powers[:, 2] * t
+    return (powers @ _BASES).reshape(-1, 3, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class FloorExpansion:
+    """Pixels of N ground points to second order in the points.
+
+    Derivatives are kept in each point's own polar basis, away from the mirror's foot and round it.
+
+    :ivar pixels: (N, 2).
+    :ivar offset: of the points from the mirror's foot (N, 2), metres.
+    :ivar outward: unit vector away from the mirror's foot (N, 2), in base_link.
+    :ivar first: d(u, v) outward and round (N, 2, 2), px per metre, the direction first.
+    :ivar second: outward twice, mixed, and round twice (N, 3, 2), px per square metre.
+    """
+
+    pixels: Array
+    offset: Array
+    outward: Array
+    first: Array
+    second: Array
+
+    def polar(self, direction: Array) -> Array:
+        """Components (N, 2), outward and round, of directions (N, 2) of base_link."""
+        x, y = self.outward[:, 0], self.outward[:, 1]
+        turned = np.empty((len(x), 2))
+        turned[:, 0] = x * direction[:, 0] + y * direction[:, 1]
+        turned[:, 1] = x * direction[:, 1] - y * direction[:, 0]
+        return turned
+
+    def slope(self, polar: Array) -> Array:
+        """First derivative (N, 2) of the pixels along directions in the polar basis (N, 2)."""
+        return polar[:, :1] * self.first[:, 0] + polar[:, 1:] * self.first[:, 1]
+
+    def curvature(self, polar: Array) -> Array:
+        """Second derivative (N, 2) of the pixels along directions in the polar basis (N, 2)."""
+        out, turned = polar[:, :1], polar[:, 1:]
+        return (out * out * self.second[:, 0] + 2.0 * out * turned * self.second[:, 1]
+                + turned * turned * self.second[:, 2])
 
 
 class FloorTable:
@@ -45,6 +102,7 @@ class FloorTable:
 
     :ivar rig: the rig that it was made for.
     :ivar reach: how far from the mirror's foot the table goes, metres.
+    :ivar height: of the mirror over the floor, metres.
     :ivar region: (height, width) uint8, 255 where a pixel sees the floor within reach.
     :raises GeometryError: if the rig sees no floor.
     """
@@ -53,12 +111,16 @@ class FloorTable:
         self.rig = rig
         self.reach = reach
         self._centre = rig.T_base_mirror.translation[:2]
-        self._height = float(rig.T_base_mirror.translation[2])
-        if self._height <= 0.0:
+        self.height = float(rig.T_base_mirror.translation[2])
+        if self.height <= 0.0:
             raise GeometryError(
-                f'the mirror at height {self._height} m does not stand over a floor')
-        self._last_angle = math.atan2(1.02 * reach, self._height)
+                f'the mirror at height {self.height} m does not stand over a floor')
+        self._last_angle = math.atan2(1.02 * reach, self.height)
         self._splines = self._forward()
+        rows, self._columns = self._splines[0].shape
+        self._last_row = rows - 3.0
+        self._knots = np.stack(self._splines, axis=-1).reshape(-1, 2)
+        self._taps = (np.arange(-1, 3)[:, None] * self._columns + np.arange(-1, 3)).ravel()
         self._grid, self._grid_reaches = self._backward()
         self.region = self._region()
 
@@ -68,7 +130,7 @@ class FloorTable:
         # keeps every point of use away from the grid's ends.
         angle = (np.arange(-_PADDING, _ANGLES + 1) / _ANGLES) * self._last_angle
         azimuth = (np.arange(-_PADDING, _AZIMUTHS + _PADDING) / _AZIMUTHS) * 2.0 * np.pi
-        radius = self._height * np.tan(angle)
+        radius = self.height * np.tan(angle)
         points = np.zeros((len(angle), len(azimuth), 3))
         points[..., 0] = self._centre[0] + radius[:, None] * np.cos(azimuth)
         points[..., 1] = self._centre[1] + radius[:, None] * np.sin(azimuth)
@@ -98,7 +160,7 @@ class FloorTable:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
         offset = points - self._centre
         radius = np.hypot(offset[:, 0], offset[:, 1])
-        angle = np.arctan2(radius, self._height)
+        angle = np.arctan2(radius, self.height)
         azimuth = np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi)
         at = np.stack([
             angle * (_ANGLES / self._last_angle) + _PADDING,
@@ -107,7 +169,41 @@ class FloorTable:
             [map_coordinates(spline, at, order=3, mode='nearest', prefilter=False)
              for spline in self._splines], axis=1)
 
-    def _backward(self) -> tuple[Array, Array]:
+    def expand(self, points: Array) -> FloorExpansion:
+        """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
+        offset = points - self._centre
+        square = np.einsum('ni,ni->n', offset, offset)
+        radius = np.sqrt(square)
+        # At the foot itself there is no direction outward; nothing is seen there but the robot.
+        radius = np.maximum(radius, 1e-6)
+        step_a, step_b = self._last_angle / _ANGLES, 2.0 * np.pi / _AZIMUTHS
+        a = np.arctan2(radius, self.height) / step_a + _PADDING
+        b = np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi) / step_b + _PADDING
+        a = np.minimum(a, self._last_row)
+        row, column = a.astype(int), b.astype(int)
+        n = len(points)
+        around = self._knots.take((row * self._columns + column)[:, None] + self._taps, axis=0)
+        by_a = (_basis(a - row) @ around.reshape(n, 4, 8)).reshape(n, 3, 4, 2)
+        partial = (_basis(b - column) @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)).reshape(
+            n, 3, 3, 2)
+        # partial[:, j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
+        p_a, p_b = partial[:, 0, 1] / step_a, partial[:, 1, 0] / step_b
+        reach = square + self.height**2
+        by_radius = (self.height / reach)[:, None]
+        inverse = (1.0 / radius)[:, None]
+        first = np.empty((n, 2, 2))
+        first[:, 0] = p_a * by_radius
+        first[:, 1] = p_b * inverse
+        second = np.empty((n, 3, 2))
+        second[:, 0] = (by_radius**2 / step_a**2) * partial[:, 0, 2] - (
+            2.0 * by_radius * (radius / reach)[:, None]) * p_a
+        second[:, 1] = (inverse * by_radius / (step_a * step_b)) * partial[:, 1, 1] - (
+            inverse * first[:, 1])
+        second[:, 2] = (inverse / step_b) ** 2 * partial[:, 2, 0] + inverse * first[:, 0]
+        return FloorExpansion(
+            partial[:, 0, 0], offset, offset * inverse, first, second)
+
+    def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
         camera = self.rig.camera
         columns = np.arange(0, camera.width + _STRIDE, _STRIDE)

@@ -22,6 +22,7 @@ from functools import cached_property
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 import numpy as np
+from numpy.typing import NDArray
 
 # Signs of the contrast (tape minus floor) in B, G, R of each class that a map may name.
 CONTRASTS: dict[str, tuple[float, float, float]] = {
@@ -34,12 +35,14 @@ CONTRASTS: dict[str, tuple[float, float, float]] = {
     'white': (1.0, 1.0, 1.0),
     'black': (-1.0, -1.0, -1.0),
 }
-# A learned contrast further than this from its class is no longer that colour.
+# A learned contrast further than this from its class, or fainter (grey levels), is not that
+# colour.
 _DRIFT_COSINE = 0.5
+_LEAST_CONTRAST = 3.0
 # A contrast is learned when its mean is this many times its standard error.
 _EVIDENT = 4.0
 # Blur that an image can have, px, and how far one image may change it.
-_BLUR_RANGE = (0.35, 3.0)
+_BLUR_RANGE = (0.25, 3.0)
 _BLUR_STEP = 0.3
 
 
@@ -68,59 +71,95 @@ class LineColour:
             raise VisionError(f'colour {name!r} is not one of {", ".join(CONTRASTS)}')
         direction = np.array(CONTRASTS[name])
         # A coloured tape is told by chromaticity: brightness is what the floor varies in.
-        grey = np.full((3, 3), 20.0**2) if abs(direction.sum()) < 1e-9 else np.zeros((3, 3))
+        coloured = abs(direction.sum()) < 1e-9
+        grey = np.full((3, 3), 20.0**2) if coloured else np.zeros((3, 3))
         return cls(name, 60.0 * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3),
                    blur)
 
     @cached_property
     def discriminant(self) -> Array:
         """Fisher's weights (3,) on B, G, R, scaled so that the tape's contrast is 1."""
-        weights = np.linalg.solve(self.clutter, self.contrast)
+        weights = np.linalg.solve(self.clutter, self.contrast).astype(float)
         return weights / float(weights @ self.contrast)
 
-    def learn(self, height: Array, power: Array, floor: Array, used: Array) -> LineColour:
+    def learn(
+        self, height: Array, power: Array, values: NDArray[np.float32],
+        beside: NDArray[np.float32], floor: Array,
+    ) -> LineColour:
         """Take over the contrast seen at N stations and the variation of the floor beside them.
 
         A pose that is wrong shows floor where it expects tape; what it would teach is refused.
 
         :param height: contrast per station (N, 3).
         :param power: its information per unit of noise (N,).
-        :param floor: samples beside the tape less their mean (N, K, 3).
-        :param used: 1 where a sample counts (N, K).
+        :param values: samples of the stations (N, K, 3).
+        :param beside: 1 where a sample lies beside the tape, else 0 (N, K).
+        :param floor: its colour (3,), grey levels.
         """
         along = height @ self.discriminant
-        mean = float(power @ along) / float(power.sum())
+        total = float(power.sum())
+        mean = float(power @ along) / total
         # Those of mere noise that happen to be positive would pass for a faint tape.
-        if mean < _EVIDENT * float(np.linalg.norm(power * (along - mean))) / float(power.sum()):
+        if mean < _EVIDENT * float(np.linalg.norm(power * (along - mean))) / total:
             return self
         good = along > 0.3 * max(float(np.median(along)), 0.0)
         if good.sum() < 10:
             return self
-        contrast = (power[good, None] * height[good]).sum(axis=0) / power[good].sum()
-        nominal = np.array(CONTRASTS[self.name])
-        cosine = contrast @ nominal / (np.linalg.norm(contrast) * np.linalg.norm(nominal) + 1e-9)
-        if cosine < _DRIFT_COSINE or np.linalg.norm(contrast) < 3.0:
+        weight = power * good
+        contrast = weight @ height / weight.sum()
+        if self._unlike(contrast, floor) or np.linalg.norm(contrast) < _LEAST_CONTRAST:
             return self
-        rows = floor[good]
-        clutter = np.einsum('nkc,nkd->cd', rows, rows) / max(used[good].sum(), 1.0)
+        # A third of the pixels is plenty for six numbers.
+        values, used = values[good, ::3], beside[good, ::3]
+        count = np.maximum(used.sum(axis=1, keepdims=True), 1.0)
+        sums = (used[:, None] @ values)[:, 0]
+        picked = (values * used[..., None]).reshape(-1, 3)
+        scatter = picked.T @ values.reshape(-1, 3) - (sums / count).T @ sums
         # One grey level of rounding keeps a noise-free image from a singular covariance.
-        clutter += 0.1 * np.eye(3)
+        degrees = max(float(used.sum()) - len(used), 1.0)
+        clutter = scatter.astype(float) / degrees + 0.1 * np.eye(3)
         return replace(self, contrast=contrast, clutter=clutter)
 
-    def sharpen(self, values: Array, height: Array, soften: Array) -> LineColour:
+    def _unlike(self, contrast: Array, floor: Array) -> bool:
+        """Whether a contrast (3,) to a floor's colour (3,) is another class's.
+
+        Relative to the floor, which takes out exposure and white balance; and for a coloured tape
+        less the brightness, which tells nothing of its hue.
+        """
+        relative = contrast / np.maximum(floor, 1.0)
+        nominal = np.array(CONTRASTS[self.name])
+        if self._coloured:
+            relative = relative - relative.mean()
+        size = float(np.linalg.norm(relative) * np.linalg.norm(nominal))
+        return float(relative @ nominal) < _DRIFT_COSINE * size or size == 0.0
+
+    @property
+    def _coloured(self) -> bool:
+        return abs(sum(CONTRASTS[self.name])) < 1e-9
+
+    def sharpen(
+        self, feature: NDArray[np.float32], height: Array, even: NDArray[np.float32],
+        power: Array, soften: NDArray[np.float32],
+    ) -> LineColour:
         """Take over the blur seen at N stations.
 
         A profile that is softer than its template leaves a residual along dT/d(blur), in
         proportion to its contrast; all stations together tell how much.
 
-        :param values: samples (N, K, 3).
-        :param height: contrast per station (N, 3).
-        :param soften: dT/d(blur) (N, K), orthogonal to floor and template.
+        :param feature: samples along the discriminant, less their mean (N, K).
+        :param height: contrast per station (N,), negative where there is none.
+        :param even: the template less its mean (N, K).
+        :param power: its power (N,).
+        :param soften: dT/d(blur) (N, K).
         """
-        along = np.maximum(height @ self.discriminant, 0.0)
-        left = np.einsum('nk,nkc,c->n', soften, values, self.discriminant)
-        power = (along**2 * (soften * soften).sum(axis=1)).sum()
-        if power < 1e-9:
+        height = np.maximum(height, 0.0)
+        mean = soften.mean(axis=1, keepdims=True)
+        shared = np.einsum('nk,nk->n', soften, even) / power
+        left = np.einsum('nk,nk->n', soften, feature) - shared * np.einsum(
+            'nk,nk->n', even, feature)
+        own = np.einsum('nk,nk->n', soften, soften - mean) - shared**2 * power
+        total = float((height**2 * own).sum())
+        if total < 1e-9:
             return self
-        step = float(np.clip((along * left).sum() / power, -_BLUR_STEP, _BLUR_STEP))
+        step = float(np.clip((height @ left) / total, -_BLUR_STEP, _BLUR_STEP))
         return replace(self, blur=float(np.clip(self.blur + step, *_BLUR_RANGE)))
