@@ -208,3 +208,25 @@ def test_too_few_pixels_are_refused() -> None:
     rays, d, mu = problem('spherical', FLOOR, Pose2(), 1, 0.0, 9)
     with pytest.raises(EstimationError, match='2 pixels'):
         refine(rays[:2], d[:2], mu[:2], Pose2())
+
+
+@pytest.mark.parametrize(
+    ('change', 'word'),
+    [
+        (lambda r, d, mu: (replace(r, direction=r.direction * np.nan), d, mu), 'ray directions'),
+        (lambda r, d, mu: (replace(r, moment=r.moment * np.inf), d, mu), 'ray moments'),
+        (lambda r, d, mu: (r, d * np.nan, mu), 'directions of the lines'),
+        (lambda r, d, mu: (r, d * 0.0, mu), 'unit length'),
+        (lambda r, d, mu: (r, d, mu * np.nan), 'moments of the lines'),
+        (lambda r, d, mu: (replace(r, hit=r.hit & False), d, mu), 'miss the mirror'),
+    ])
+def test_impossible_input_is_refused_by_name(change, word: str) -> None:
+    rays, d, mu = change(*problem('spherical', FLOOR, Pose2(), 5, 0.0, 9))
+    with pytest.raises(EstimationError, match=word):
+        refine(rays, d, mu, Pose2())
+
+
+@pytest.mark.parametrize('sigma', [0.0, -1.0, np.nan, np.inf])
+def test_impossible_noise_is_refused(sigma: float) -> None:
+    with pytest.raises(EstimationError, match='sigma'):
+        refine(*problem('spherical', FLOOR, Pose2(), 5, 0.0, 9), Pose2(), sigma=sigma)

@@ -82,18 +82,21 @@ def gram(rows: Array, weights: Array) -> Array:
 
 def monomials(pose: Pose2) -> Array:
     """The monomials (7,) of a pose."""
-    c, s = math.cos(pose.yaw), math.sin(pose.yaw)
-    x, y = pose.x, pose.y
-    return np.array([c, s, x, y, c * x + s * y, c * y - s * x, 1.0])
+    return monomials_and_slopes(pose.x, pose.y, pose.yaw)[0]
 
 
 def monomials_jacobian(pose: Pose2) -> Array:
     """Their derivatives by (x, y, yaw), (7, 3)."""
-    c, s = math.cos(pose.yaw), math.sin(pose.yaw)
-    p, q = c * pose.x + s * pose.y, c * pose.y - s * pose.x
+    return monomials_and_slopes(pose.x, pose.y, pose.yaw)[1:].T
+
+
+def monomials_and_slopes(x: float, y: float, yaw: float) -> Array:
+    """The monomials of a pose, and below them their derivatives by x, y and yaw, (4, 7)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    p, q = c * x + s * y, c * y - s * x
     return np.array([
-        [0.0, 0.0, -s], [0.0, 0.0, c], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0],
-        [c, s, q], [-s, c, -p], [0.0, 0.0, 0.0]])
+        [c, s, x, y, p, q, 1.0], [0.0, 0.0, 1.0, 0.0, c, -s, 0.0],
+        [0.0, 0.0, 0.0, 1.0, s, c, 0.0], [-s, c, 0.0, 0.0, q, -p, 0.0]])
 
 
 def feet_in_plan(directions: Array, moments: Array) -> Array:

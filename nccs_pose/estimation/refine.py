@@ -17,10 +17,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.side_form import SideForm
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
 from numpy.typing import NDArray
@@ -71,12 +72,12 @@ class _Problem:
 
     def deviation(self, unknowns: Array) -> Array:
         difference = unknowns - self.expected
-        difference[2] = wrap_angle(difference[2])
+        difference[2] = math.remainder(difference[2], 2.0 * math.pi)
         return difference
 
     def cost(self, e: Array, width: float, unknowns: Array) -> float:
         """Cauchy's loss of the residuals (their squares at infinite width), and the prior."""
-        loss = e @ e if np.isinf(width) else width**2 * np.log1p((e / width) ** 2).sum()
+        loss = e @ e if np.isinf(width) else width**2 * np.log1p(np.square(e / width)).sum()
         deviation = self.deviation(unknowns)
         return float(loss + deviation @ self.information @ deviation)
 
@@ -113,13 +114,12 @@ def refine(
         pixels averages it out, so it widens the covariance.
     :param robust: False takes every pixel for an inlier.
     :param noise_known: False takes ``sigma`` for relative and its scale from the residuals.
-    :raises EstimationError: with fewer than three rays, or a ray that missed the mirror.
+    :raises EstimationError: with fewer than three rays, a ray that missed the mirror, a line
+        direction that is not of unit length, a sigma that is not positive, or a value that is
+        not finite.
     """
-    if len(rays) < 3:
-        raise EstimationError(f'{len(rays)} pixels cannot fix a pose; at least 3 are needed')
-    if not rays.hit.all():
-        raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
     sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
+    _check(rays, directions, moments, sigma)
     expected, known = _prior(start, prior, attitude_sigma)
     form = SideForm(rays, directions, moments, sigma, sigma_world, len(expected) == 6)
     problem = _Problem(form, expected, known)
@@ -149,6 +149,25 @@ def refine(
     return Refinement(
         Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
         attitude, e, inlier, scale, converged and finished)
+
+
+def _check(rays: Rays, directions: Array, moments: Array, sigma: Array) -> None:
+    if len(rays) < 3:
+        raise EstimationError(f'{len(rays)} pixels cannot fix a pose; at least 3 are needed')
+    if not rays.hit.all():
+        raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
+    for name, value in (
+            ('ray directions', rays.direction), ('ray moments', rays.moment),
+            ('derivatives of ray directions', rays.direction_jacobian),
+            ('derivatives of ray moments', rays.moment_jacobian),
+            ('directions of the lines', directions), ('moments of the lines', moments),
+            ('sigma', sigma)):
+        if not np.isfinite(value).all():
+            raise EstimationError(f'{name}: not all finite')
+    if not sigma.min() > 0.0:
+        raise EstimationError(f'sigma = {sigma.min()} px: must be positive')
+    if np.abs(np.einsum('ni,ni->n', directions, directions) - 1.0).max() > 1e-6:
+        raise EstimationError('directions of the lines: not all of unit length')
 
 
 def _prior(
@@ -183,16 +202,16 @@ def _descend(
     problem: _Problem, unknowns: Array, cauchy: bool, max_iterations: int,
 ) -> tuple[Array, bool]:
     """Levenberg-Marquardt; returns where it ends and whether it converged."""
-    damping = 0.0
+    damping, known = 0.0, problem.information + _vague(len(unknowns))
     e, jacobian = problem.form.residual(unknowns)
     for _ in range(max_iterations):
         width = _CAUCHY * _robust_scale(e) if cauchy else np.inf
-        weight = 1.0 / (1.0 + (e / width) ** 2)
-        normal = ((jacobian * weight[:, None]).T @ jacobian + problem.information
-                  + _vague(len(unknowns)))
-        slope = (jacobian.T @ (weight * e)
-                 + problem.information @ problem.deviation(unknowns))
-        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
+        weight = 1.0 / (1.0 + np.square(e / width))
+        weighted = jacobian.T * weight
+        normal = weighted @ jacobian + known
+        slope = weighted @ e + problem.information @ problem.deviation(unknowns)
+        damped = normal + damping * np.diag(np.diag(normal)) if damping else normal
+        step = -np.linalg.solve(damped, slope)
         trial = unknowns + step
         e_trial, jacobian_trial = problem.form.residual(trial)
         if problem.cost(e_trial, width, trial) <= problem.cost(e, width, unknowns):
@@ -202,7 +221,7 @@ def _descend(
             damping = max(1e-3, 10.0 * damping)
         # A step far below what the pixels can tell ends the search; the robust stage only has to
         # find the inliers.
-        if float(step @ normal @ step) < (1e-4 if cauchy else 1e-10):
+        if float(step @ normal @ step) < (1e-4 if cauchy else 1e-7):
             return unknowns, True
         if damping > 1e8:
             return unknowns, False

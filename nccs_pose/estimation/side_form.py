@@ -21,8 +21,8 @@ another ray. All are rows of one array, and a pose costs one small matrix produc
 
 from __future__ import annotations
 
-from nccs_pose.estimation.pose_monomials import monomial_rows, monomials, monomials_jacobian
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.estimation.pose_monomials import monomial_rows, monomials_and_slopes
+from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rays
 import numpy as np
 
@@ -72,8 +72,7 @@ class SideForm:
 
         :param unknowns: (x, y, yaw), followed by (z, roll, pitch) with the attitude.
         """
-        pose = Pose2(*unknowns[:3].tolist())
-        form = np.vstack([monomials(pose), monomials_jacobian(pose).T])
+        form = monomials_and_slopes(*unknowns[:3].tolist())
         values = (form @ self._rows.reshape(7, -1)).reshape(4, *self._rows.shape[1:])
         s, s_pose = values[0, 0], values[1:, 0]
         g_u, g_v = values[0, 1], values[0, 2]
@@ -95,7 +94,7 @@ class SideForm:
 
     def image_shift(self, unknowns: Array) -> Array:
         """de/d(u, v) (N, 2): what a shift of the whole image does to the residuals."""
-        form = monomials(Pose2(*unknowns[:3].tolist()))
+        form = monomials_and_slopes(*unknowns[:3].tolist())[0]
         g_u, g_v = form @ self._rows[:, 1], form @ self._rows[:, 2]
         variance = self._variance * (g_u * g_u + g_v * g_v)
         return (np.stack([g_u, g_v]) / np.sqrt(np.maximum(variance, 1e-30))).T
