@@ -72,6 +72,11 @@ def test_sixteen_bits_keep_the_upper_eight(big: int, order: str, extra: int) -> 
     for encoding, channels in (('bgr16', [0, 1, 2]), ('rgb16', [2, 1, 0])):
         rows = values[:, :, channels].astype(order, order='C').view(np.uint8)
         np.testing.assert_array_equal(decoded(encoding, rows, (6, 8), extra, big), NOISE)
+    alpha = rng.integers(0, 65536, (6, 8, 1)).astype(np.uint16)
+    for encoding, channels in (('bgra16', [0, 1, 2]), ('rgba16', [2, 1, 0])):
+        rows = np.concatenate([values[:, :, channels], alpha], axis=2)
+        rows = rows.astype(order, order='C').view(np.uint8)
+        np.testing.assert_array_equal(decoded(encoding, rows, (6, 8), extra, big), NOISE)
     rows = values[:, :, 1].astype(order, order='C').view(np.uint8)
     np.testing.assert_array_equal(
         decoded('mono16', rows, (6, 8), extra, big), NOISE[:, :, [1, 1, 1]])
@@ -87,6 +92,10 @@ def test_bayer_patterns_give_each_colour_back(pattern: str) -> None:
     image = decoded(f'bayer_{pattern}8', mosaic, picture.shape[:2], extra=5)
     inner = np.s_[2:-2, 2:-2]
     assert np.abs(image[inner].astype(int) - picture[inner]).max() <= 4
+    for big, order in ((0, '<u2'), (1, '>u2')):
+        deep = (mosaic.astype(np.uint16) * 256 + 77).astype(order).view(np.uint8)
+        np.testing.assert_array_equal(
+            decoded(f'bayer_{pattern}16', deep, picture.shape[:2], 6, big), image)
 
 
 def bt601(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -118,8 +127,9 @@ def test_yuv_encodings_follow_bt601() -> None:
 def test_every_encoding_is_tested_here() -> None:
     assert set(ENCODINGS) == {
         'bgr8', '8UC3', 'rgb8', 'bgra8', '8UC4', 'rgba8', 'mono8', '8UC1', 'mono16', 'bgr16',
-        'rgb16', 'bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8', 'yuv422', 'uyvy',
-        'yuv422_yuy2', 'yuyv', 'nv12', 'nv21'}
+        'rgb16', 'bgra16', 'rgba16', 'bayer_rggb16', 'bayer_bggr16', 'bayer_gbrg16',
+        'bayer_grbg16', 'bayer_rggb8', 'bayer_bggr8', 'bayer_gbrg8', 'bayer_grbg8', 'yuv422',
+        'uyvy', 'yuv422_yuy2', 'yuyv', 'nv12', 'nv21'}
 
 
 def test_bgr8_without_padding_is_a_view_of_any_buffer() -> None:

@@ -31,6 +31,11 @@ Image = NDArray[np.uint8]
 _MOST_PIXELS = 64_000_000
 """A header may announce gigabytes; nothing that this camera could be is larger than this."""
 
+_BAYER = {
+    # OpenCV names a pattern by its second row, ROS by its first.
+    'rggb': cv2.COLOR_BayerBG2BGR, 'bggr': cv2.COLOR_BayerRG2BGR,
+    'gbrg': cv2.COLOR_BayerGR2BGR, 'grbg': cv2.COLOR_BayerGB2BGR,
+}
 _CONVERSIONS: dict[str, tuple[int, int | None]] = {
     # encoding: (bytes a pixel, OpenCV's conversion to BGR)
     'bgr8': (3, None),
@@ -41,21 +46,20 @@ _CONVERSIONS: dict[str, tuple[int, int | None]] = {
     'rgba8': (4, cv2.COLOR_RGBA2BGR),
     'mono8': (1, cv2.COLOR_GRAY2BGR),
     '8UC1': (1, cv2.COLOR_GRAY2BGR),
-    # OpenCV names a Bayer pattern by its second row, ROS by its first.
-    'bayer_rggb8': (1, cv2.COLOR_BayerBG2BGR),
-    'bayer_bggr8': (1, cv2.COLOR_BayerRG2BGR),
-    'bayer_gbrg8': (1, cv2.COLOR_BayerGR2BGR),
-    'bayer_grbg8': (1, cv2.COLOR_BayerGB2BGR),
+    **{f'bayer_{pattern}8': (1, code) for pattern, code in _BAYER.items()},
     'yuv422': (2, cv2.COLOR_YUV2BGR_UYVY),
     'uyvy': (2, cv2.COLOR_YUV2BGR_UYVY),
     'yuv422_yuy2': (2, cv2.COLOR_YUV2BGR_YUY2),
     'yuyv': (2, cv2.COLOR_YUV2BGR_YUY2),
 }
-_SIXTEEN_BIT = {'mono16': (1, 1), 'bgr16': (3, 1), 'rgb16': (3, -1)}
-"""Encoding: channels, and the step through them that gives blue first."""
+_SIXTEEN_BIT = {
+    'mono16': (1, slice(1)), 'bgr16': (3, slice(3)), 'rgb16': (3, slice(2, None, -1)),
+    'bgra16': (4, slice(3)), 'rgba16': (4, slice(2, None, -1))}
+"""Encoding: channels, and those of them that give blue, green, red."""
+_BAYER_16 = {f'bayer_{pattern}16': code for pattern, code in _BAYER.items()}
 _SEMI_PLANAR = {'nv12': cv2.COLOR_YUV2BGR_NV12, 'nv21': cv2.COLOR_YUV2BGR_NV21}
 
-ENCODINGS = (*_CONVERSIONS, *_SIXTEEN_BIT, *_SEMI_PLANAR)
+ENCODINGS = (*_CONVERSIONS, *_SIXTEEN_BIT, *_BAYER_16, *_SEMI_PLANAR)
 """Encodings of raw images that :func:`decode_image` reads."""
 
 
@@ -64,8 +68,8 @@ def decode_image(
 ) -> Image:
     """Decode a raw image to BGR.
 
-    A bgr8 image without row padding is a view of `data`; everything else is copied once. Of
-    16-bit values the upper eight bits are kept.
+    A bgr8 image without row padding is a view of `data`; everything else is copied once
+    (16-bit Bayer patterns twice). Of 16-bit values the upper eight bits are kept.
 
     :param step: bytes a row, padding included.
     :param data: any buffer of bytes.
@@ -77,19 +81,24 @@ def decode_image(
         bytes_a_pixel = 1
     elif encoding in _SIXTEEN_BIT:
         bytes_a_pixel = 2 * _SIXTEEN_BIT[encoding][0]
+    elif encoding in _BAYER_16:
+        bytes_a_pixel = 2
     elif encoding in _CONVERSIONS:
         bytes_a_pixel = _CONVERSIONS[encoding][0]
     else:
         raise VisionError(
             f'image encoding {encoding!r} is not known; known are {", ".join(ENCODINGS)}')
-    if semi_planar or bytes_a_pixel == 2:
+    if semi_planar or encoding.startswith(('yuv', 'uyvy', 'yuyv')):
         _check_even(encoding, width, height if semi_planar else 2)
     table_height = height * 3 // 2 if semi_planar else height
     rows = _rows(encoding, table_height, width * bytes_a_pixel, step, data)
+    high = rows[:, (0 if is_bigendian else 1)::2]
     if encoding in _SIXTEEN_BIT:
         channels, order = _SIXTEEN_BIT[encoding]
-        high = rows[:, (0 if is_bigendian else 1)::2].reshape(height, width, channels)
-        return _contiguous(np.broadcast_to(high[:, :, ::order], (height, width, 3)))
+        colours = high.reshape(height, width, channels)[:, :, order]
+        return _contiguous(np.broadcast_to(colours, (height, width, 3)))
+    if encoding in _BAYER_16:
+        return _convert(_contiguous(high), _BAYER_16[encoding], encoding)
     if semi_planar:
         return _convert(rows, _SEMI_PLANAR[encoding], encoding)
     code = _CONVERSIONS[encoding][1]
