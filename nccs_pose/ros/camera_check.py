@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.camera import PinholeCamera
 import numpy as np
 from sensor_msgs.msg import CameraInfo
@@ -45,4 +48,28 @@ def contradiction(info: CameraInfo, camera: PinholeCamera, tolerance: float) -> 
         # Not '>': a NaN contradicts too.
         if not abs(their - our) <= tolerance * camera.fx:
             return f'camera_info says {name} = {their:g} px, the rig {our:g} px'
+    return _distortion(info, camera, tolerance)
+
+
+def _distortion(info: CameraInfo, camera: PinholeCamera, tolerance: float) -> str:
+    """Whether both distort alike, by where they put the pixels of the image."""
+    try:
+        other = replace(
+            camera, distortion_model=info.distortion_model or camera.distortion_model,
+            distortion=tuple(info.d))
+    except GeometryError as error:
+        return f'camera_info is none of a camera that the rig could have: {error}'
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    directions = camera.directions(pixels)
+    pixels, directions = pixels[directions[:, 2] > 0.0], directions[directions[:, 2] > 0.0]
+    apart = np.abs(other.project(directions)[0] - pixels).max(initial=0.0)
+    if not apart <= tolerance * camera.fx + 1e-6:  # there and back is rounded
+        return (f'camera_info says distortion {_coefficients(other)}, the rig '
+                f'{_coefficients(camera)}: up to {apart:.1f} px apart')
     return ''
+
+
+def _coefficients(camera: PinholeCamera) -> str:
+    numbers = ', '.join(f'{k:g}' for k in camera.distortion)
+    return f'{camera.distortion_model} [{numbers}]'

@@ -49,6 +49,12 @@ class Process:
                 [sys.executable, '-m', f'nccs_pose.ros.{module}', *arguments], cwd=REPOSITORY,
                 env=environment, stdout=file, stderr=subprocess.STDOUT)
 
+    def catches(self, how: signal.Signals) -> bool:
+        """Whether it has a handler for a signal yet."""
+        status = Path(f'/proc/{self._popen.pid}/status').read_text()
+        mask = next(line for line in status.splitlines() if line.startswith('SigCgt'))
+        return bool(int(mask.split()[1], 16) >> (how - 1) & 1)
+
     def running(self) -> bool:
         """Whether it still runs."""
         return self._popen.poll() is None
@@ -109,9 +115,11 @@ class User:
         assert self.wait(
             lambda: self.value(f'{name}: pose', 'lifecycle') == 'active'), node.output
 
-    def publisher(self, kind: type, topic: str, node: str = 'localiser') -> Any:
+    def publisher(
+        self, kind: type, topic: str, node: str = 'localiser', depth: int = 100,
+    ) -> Any:
         """A publisher that the node already knows of."""
-        publisher = self.node.create_publisher(kind, topic, 100)
+        publisher = self.node.create_publisher(kind, topic, depth)
         assert self.wait(lambda: publisher.get_subscription_count() > 0), topic
         if topic.split('/')[-1] in ('image', 'compressed'):
             assert self.wait(lambda: self.count('publishers', node) > 0), topic
@@ -127,6 +135,27 @@ class User:
                 return value
             self._executor.spin_once(timeout_sec=0.02)
         return value
+
+    def insist(self, publisher: Any, message: Any, condition: Callable[[], Any]) -> Any:
+        """Publish until the condition holds: a best-effort subscriber may learn of us late."""
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            publisher.publish(message)
+            if value := self.wait(condition, 1.0):
+                return value
+        return False
+
+    def frames(self, node: str = 'localiser') -> int:
+        """How many images the node has accounted for."""
+        return sum(self.count(key, node) for key in (
+            'frames_received', 'frames_dropped_busy', 'frames_lost_by_middleware'))
+
+    def show(self, publisher: Any, *images: Any, node: str = 'localiser') -> None:
+        """Publish images, each when the node has accounted for the one before."""
+        for image in images:
+            before = self.frames(node)
+            publisher.publish(image)
+            assert self.wait(lambda n=before: self.frames(node) > n), self.statuses
 
     def spin(self, seconds: float) -> None:
         """Spin for a while."""
@@ -161,18 +190,18 @@ class World:
     """A DDS domain of its own, the processes in it and a user."""
 
     def __init__(self, domain: int, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._domain = domain
         self._processes: list[Process] = []
         self.user = User(domain)
 
     def start(self, module: str, *arguments: str, **environment: str) -> Process:
         """Start `python -m nccs_pose.ros.<module>`."""
-        log = self._folder / f'{len(self._processes)}_{module}.log'
+        log = self.folder / f'{len(self._processes)}_{module}.log'
         process = Process(module, list(arguments), {
             **os.environ, 'ROS_DOMAIN_ID': str(self._domain),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_LOG_DIR': str(self._folder / 'ros_log'), **environment}, log)
+            'ROS_LOG_DIR': str(self.folder / 'ros_log'), **environment}, log)
         self._processes.append(process)
         return process
 

@@ -190,6 +190,9 @@ def test_camera_info_of_the_rig_agrees():
     ({'k': [750.0, 0.0, 641.0, 0.0, 750.0, 400.0, 0.0, 0.0, 1.0]}, ('cy = 400', '477.5')),
     ({'k': [math.nan] * 9}, ('nan', '750')),
     ({'binning_x': 2, 'binning_y': 2}, ('2 x 2',)),
+    ({'d': [-0.3, 0.1, 0.0, 0.0, 0.0]}, ('plumb_bob [-0.3, 0.1', 'plumb_bob []', 'px apart')),
+    ({'d': [math.nan] * 5}, ('nan',)),
+    ({'d': [0.1] * 4, 'distortion_model': 'equidistant'}, ('equidistant',)),
 ])
 def test_camera_info_of_another_camera_is_said_with_both_numbers(changes, words):
     camera = arena_rig().camera

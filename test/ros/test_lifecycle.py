@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 import pytest
@@ -24,8 +25,12 @@ pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nccs_pose.ros.conversions import image_message
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
+ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
 ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
 
 
@@ -98,19 +103,52 @@ def test_transforms_without_tf2_ros_fail_with_the_reason(world):
 
 
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_active_node_cleanly(world, how):
-    node, user = world.localiser(**ROOM), world.user
-    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'active'), node.output
+def test_signals_end_the_node_that_works_on_images(world, arena, how):
+    node, user = world.localiser(**ARENA), world.user
+    images = user.publisher(Image, 'image')
+    messages = [image_message(s.stamp_ns, 'camera', s.image) for s in arena]
+    user.show(images, messages[0])
+    for message in messages[1:]:
+        images.publish(message)
     assert node.stop(how) == 0, node.output
     assert 'Traceback' not in node.output
 
 
-def test_silence_is_said_with_the_topic(world):
-    node = world.localiser('-r', 'image:=/front/image', silence_warning=0.5, **ROOM)
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_the_node_while_it_starts(world, how):
+    caught = [world.localiser(**ROOM) for _ in range(3)]
+    # From the first moment on; among the imports; somewhere before it is active.
+    for node, pause in zip(caught, (0.0, 0.3, 1.0)):
+        assert world.user.wait(lambda n=node: n.catches(how)), node.output
+        world.user.spin(pause)
+        assert node.stop(how) == 0, node.output
+        assert 'Traceback' not in node.output
+
+
+@pytest.mark.parametrize('module', ['localiser', 'stand_in_camera', 'player'])
+def test_without_a_home_it_starts_all_the_same(world, module):
+    arguments = {'player': ['bags/room', '--start-offset', '29.5']}.get(module, [])
+    node = world.start(module, *arguments, ROS_LOG_DIR='', HOME='', TMPDIR=str(world.folder))
+    assert world.user.wait(
+        lambda: [*world.folder.glob(f'ros_log_{os.getuid()}/*')] or not node.running())
+    assert node.stop() == 0, node.output
+    assert 'Traceback' not in node.output
+
+
+def test_silence_is_said_with_the_topic_and_the_reason(world):
+    reliability = 'qos_overrides./front/image.subscription.reliability'
+    node = world.localiser(
+        '-r', 'image:=/front/image', '-p', f'{reliability}:=reliable', silence_warning=0.5, **ROOM)
     user = world.user
-    assert user.wait(lambda: 'nothing publishes /front/image' in getattr(
-        user.statuses.get('localiser: images'), 'message', '')), node.output
+
+    def said(words: str) -> bool:
+        return words in getattr(user.statuses.get('localiser: images'), 'message', '')
+
+    assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     assert 'nothing publishes /front/image' in node.output
+    user.node.create_publisher(
+        Image, '/front/image', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    assert user.wait(lambda: said(f'set {reliability}')), node.output
 
 
 def test_pause_is_said(world):

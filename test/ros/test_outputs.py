@@ -20,9 +20,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
+from diagnostic_msgs.msg import DiagnosticStatus
+from nccs_pose.calibration.monitor import Condition, Verdict
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.ros import calibration_watch
 from nccs_pose.ros import outputs as outputs_module
 from nccs_pose.ros.conversions import decode
 from nccs_pose.ros.markers import ELLIPSE_SIGMAS, marker_array
@@ -120,3 +123,36 @@ def test_markers_lie_in_the_map():
     np.testing.assert_allclose(axes, [2 * ELLIPSE_SIGMAS * 0.01, 2 * ELLIPSE_SIGMAS * 0.02])
     gone = marker_array('map', LOST, RIG, MAP).markers
     assert [m.action for m in gone] == [Marker.ADD, *[Marker.DELETE] * 3]
+
+
+class Monitor:
+    """A calibration monitor with a mind made up."""
+
+    def __init__(self, rig: object, line_map: object) -> None:
+        self.seen: list[int] = []
+        self.condition = Condition.GOOD
+
+    def add(self, estimate: Estimate) -> None:
+        self.seen.append(estimate.stamp_ns)
+
+    def verdict(self) -> Verdict:
+        words = 'residuals suggest the mirror moved by about 0.3 mm'
+        return Verdict(self.condition, words, 40, 90.0, 30.0, 0.02)
+
+
+def test_calibration_is_watched_now_and_then_and_a_suspicion_is_a_warning(
+        monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(calibration_watch, 'CalibrationMonitor', Monitor)
+    watch = calibration_watch.CalibrationWatch(RIG, MAP)
+    for k in range(31):  # a second at 30 Hz
+        watch.look(Estimate(10**12 + k * 33_333_334, State.TRACKING, ''))
+    watch.look(Estimate(5, State.LOST, 'the clock was set back'))
+    monitor = watch._monitor
+    assert len(monitor.seen) == 7
+    assert min(np.diff(monitor.seen[:-1])) >= calibration_watch.PERIOD_NS
+    assert watch.status('localiser').level == DiagnosticStatus.OK
+    monitor.condition = Condition.SUSPECT
+    status = watch.status('localiser')
+    assert (status.name, status.level) == ('localiser: calibration', DiagnosticStatus.WARN)
+    assert 'the mirror moved by about 0.3 mm' in status.message
+    assert {v.key: v.value for v in status.values}['pose_error_m'] == '0.02'

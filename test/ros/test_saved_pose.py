@@ -83,12 +83,9 @@ def test_pose_is_saved_at_the_end_and_offered_at_the_next_start(world, arena, tm
     node = world.localiser(saved_pose_file=path, **ARENA)
     poses = user.listen(PoseWithCovarianceStamped, 'pose')
     images = user.publisher(Image, 'image')
-    for sample in arena:
-        images.publish(image_message(sample.stamp_ns, 'camera', sample.image))
-        user.spin(0.05)
-    assert user.wait(lambda: poses), node.output
+    user.show(images, *(image_message(s.stamp_ns, 'camera', s.image) for s in arena))
+    assert user.wait(lambda: poses and len(poses) == user.count('frames_answered')), node.output
     assert node.stop(signal.SIGTERM) == 0, node.output
-    user.spin(0.2)
     saved, last = read_saved_pose(path), poses[-1].pose.pose.position
     assert (saved.pose.x, saved.pose.y) == (last.x, last.y)
     assert saved.map_hash == map_hash(arena_map())
