@@ -23,7 +23,8 @@ Q = V^T G V (3 x 3),
 N is a trigonometric polynomial of degree 4 and D one of degree 2 (the entries of Q have degree
 2, but the highest terms cancel), so J' = 0 is one of degree 6: its at most 12 roots on the unit
 circle z = exp(i yaw) are all stationary points, and nothing is searched for. Sixteen samples of
-the yaw determine both polynomials exactly.
+the yaw determine both polynomials exactly. Once the weights are known to change little, Newton's
+method on J' takes a minimum to its new place.
 """
 
 from __future__ import annotations
@@ -46,11 +47,15 @@ ALIGNED = 1e-9
 # A root this close to the unit circle is a real yaw: two that nearly meet leave it by the root
 # of their rounding.
 _ON_CIRCLE = 1e-4
+# Newton's method is given up further from its start than this (rad), or after so many steps.
+_ASTRAY = 0.1
+_NEWTON_STEPS = 8
+_HARMONICS = np.arange(-6, 7)
 _YAWS = 2.0 * math.pi * np.arange(16) / 16
 # From samples at those yaws to Fourier coefficients, -6 to 6, and to the samples' derivatives.
-_FOURIER = np.exp(-1j * np.arange(-6, 7)[:, None] * _YAWS) / 16
-_DERIVATIVE = (np.exp(1j * _YAWS[:, None] * np.arange(-6, 7)) @ (
-    1j * np.arange(-6, 7)[:, None] * _FOURIER)).real
+_FOURIER = np.exp(-1j * _HARMONICS[:, None] * _YAWS) / 16
+_DERIVATIVE = (np.exp(1j * _YAWS[:, None] * _HARMONICS) @ (
+    1j * _HARMONICS[:, None] * _FOURIER)).real
 
 
 def _parametrisation(yaws: Array) -> Array:
@@ -79,15 +84,33 @@ def general_minima(gram: Array) -> tuple[Minimum, ...]:
 
     :param gram: Gram matrix of S (7, 7).
     """
-    q00, q11, q22, q01, q02, q12 = (_SAMPLES @ gram.ravel()).reshape(6, 16)
-    minor = q00 * q11 - q01 * q01
-    full = minor * q22 - q00 * q12 * q12 - q11 * q02 * q02 + 2.0 * q01 * q02 * q12
-    slope = (_DERIVATIVE @ full) * minor - full * (_DERIVATIVE @ minor)
-    yaws = _minima_of_slope(_FOURIER @ slope)
+    yaws = _minima_of_slope(_slope(gram))
     if not len(yaws):
         # Flat up to rounding: any yaw is as good.
         return _minima_at(gram, _YAWS)[:1]
     return _minima_at(gram, yaws)
+
+
+def _slope(gram: Array) -> NDArray[np.complex128]:
+    """Fourier coefficients (13,) of N' D - N D', which has the sign of J'."""
+    q00, q11, q22, q01, q02, q12 = (_SAMPLES @ gram.ravel()).reshape(6, 16)
+    minor = q00 * q11 - q01 * q01
+    full = minor * q22 - q00 * q12 * q12 - q11 * q02 * q02 + 2.0 * q01 * q02 * q12
+    return _FOURIER @ ((_DERIVATIVE @ full) * minor - full * (_DERIVATIVE @ minor))
+
+
+def _minimum_downhill(gram: Array, yaw: float) -> Minimum | None:
+    """The minimum that Newton's method on J' reaches from a yaw; None where it strays."""
+    coefficients, start = _slope(gram), yaw
+    both = np.stack([coefficients, 1j * _HARMONICS * coefficients], axis=1)
+    for _ in range(_NEWTON_STEPS):
+        slope, curvature = (np.exp(1j * yaw * _HARMONICS) @ both).real.tolist()
+        if curvature <= 0.0 or abs(slope) > _ASTRAY * curvature or abs(yaw - start) > _ASTRAY:
+            return None
+        yaw -= slope / curvature
+        if abs(slope) < 1e-12 * curvature:
+            return _minima_at(gram, np.array([yaw]))[0]
+    return None
 
 
 def _minima_of_slope(slope: NDArray[np.complex128]) -> Array:
@@ -128,8 +151,31 @@ def all_minima(gram: Array, directions: Array) -> tuple[Minimum, ...]:
     :param gram: Gram matrix of S (7, 7).
     :param directions: unit directions of the lines (L, 3).
     """
-    if (np.abs(directions[:, 2]) <= ALIGNED).all():
+    if _are_horizontal(directions):
         return horizontal_minima(gram)
-    if (np.abs(directions[:, :2]) <= ALIGNED).all():
+    if _are_vertical(directions):
         return vertical_minima(gram)
     return general_minima(gram)
+
+
+def _are_horizontal(directions: Array) -> bool:
+    return bool((np.abs(directions[:, 2]) <= ALIGNED).all())
+
+
+def _are_vertical(directions: Array) -> bool:
+    return bool((np.abs(directions[:, :2]) <= ALIGNED).all())
+
+
+def minimum_near(gram: Array, directions: Array, yaw: float) -> Minimum:
+    """The local minimum that belongs to a yaw from which it cannot be far.
+
+    :param gram: Gram matrix of S (7, 7).
+    :param directions: unit directions of the lines (L, 3).
+    """
+    if not _are_horizontal(directions) and not _are_vertical(directions):
+        found = _minimum_downhill(gram, yaw)
+        if found is not None:
+            return found
+    return min(
+        all_minima(gram, directions),
+        key=lambda m: abs(math.remainder(m.pose.yaw - yaw, 2.0 * math.pi)))

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.general_lines import ALIGNED, all_minima
+from nccs_pose.estimation.general_lines import ALIGNED, all_minima, minimum_near
 from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.observability import (
     Symmetry,
@@ -153,9 +153,8 @@ def _weighted(data: LabelledRays, pose: Pose2) -> _Found:
     """
     for _ in range(_REWEIGHTINGS):
         weights = 1.0 / data.variance(pose)
-        minima = all_minima(gram(data.rows, weights), data.directions)
         before = pose
-        pose = min(minima, key=lambda m: abs(_difference(m.pose.yaw, before.yaw))).pose
+        pose = minimum_near(gram(data.rows, weights), data.directions, pose.yaw).pose
         if abs(_difference(pose.yaw, before.yaw)) < _CLOSE_START:
             break
     return _polished(data, weights, pose)

@@ -126,13 +126,13 @@ def refine(
     unknowns = np.concatenate([start.as_array(), expected[3:]])
     inlier, scale, converged = np.ones(len(rays), dtype=bool), 1.0, True
     if robust:
-        unknowns, converged = _descend(problem, unknowns, True, max_iterations)
-        e, _ = form.residual(unknowns)
+        unknowns, e, jacobian, converged = _descend(problem, unknowns, True, max_iterations)
         scale = _robust_scale(e)
         inlier = np.abs(e) <= _GATE * scale
-    trusted = replace(problem, form=form.of(inlier))
-    unknowns, finished = _descend(trusted, unknowns, False, max_iterations)
-    e, jacobian = form.residual(unknowns)
+    trusted = problem if inlier.all() else replace(problem, form=form.of(inlier))
+    unknowns, e, jacobian, finished = _descend(trusted, unknowns, False, max_iterations)
+    if trusted is not problem:
+        e, jacobian = form.residual(unknowns)
     normal = jacobian[inlier].T @ jacobian[inlier]
     # Residuals larger than the noise was told to be widen the claim; smaller ones do not
     # narrow it.
@@ -200,8 +200,11 @@ def _robust_scale(e: Array) -> float:
 
 def _descend(
     problem: _Problem, unknowns: Array, cauchy: bool, max_iterations: int,
-) -> tuple[Array, bool]:
-    """Levenberg-Marquardt; returns where it ends and whether it converged."""
+) -> tuple[Array, Array, Array, bool]:
+    """Levenberg-Marquardt.
+
+    :returns: where it ends, residuals and their Jacobian there, and whether it converged.
+    """
     damping, known = 0.0, problem.information + _vague(len(unknowns))
     e, jacobian = problem.form.residual(unknowns)
     for _ in range(max_iterations):
@@ -221,8 +224,8 @@ def _descend(
             damping = max(1e-3, 10.0 * damping)
         # A step far below what the pixels can tell ends the search; the robust stage only has to
         # find the inliers.
-        if float(step @ normal @ step) < (1e-4 if cauchy else 1e-7):
-            return unknowns, True
+        if float(step @ normal @ step) < (1e-2 if cauchy else 1e-7):
+            return unknowns, e, jacobian, True
         if damping > 1e8:
-            return unknowns, False
-    return unknowns, False
+            return unknowns, e, jacobian, False
+    return unknowns, e, jacobian, False
