@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-from nccs_pose.calibration.adjustment import adjust, ArrowSystem, Problem
+from nccs_pose.calibration.adjustment import adjust, ArrowSystem
 from nccs_pose.calibration.frames import choose, frame_information
 from nccs_pose.calibration.gauge import gauges, pose_uncertainty, weak_directions
 from nccs_pose.calibration.judgement import frame_residual
@@ -27,6 +27,7 @@ from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import left_jacobian, RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
+from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.procedure import calibrate
 from nccs_pose.calibration.sensitivity import side_sensitivity
 from nccs_pose.errors import CalibrationError
@@ -217,6 +218,26 @@ def test_errors_are_as_large_as_the_standard_deviations_say():
     assert freedom >= 12 * 5
     low, high = chi2.ppf([0.005, 0.995], freedom)
     assert low < total < high
+
+
+def test_what_is_weakly_seen_is_off_by_no_more_than_it_says():
+    """Derivatives that follow the pixels' noise would put it off by five standard deviations."""
+    for seed, kind in enumerate(('hyperbolic', 'parabolic', 'hyperbolic', 'parabolic')):
+        rng, true = np.random.default_rng(5 + seed), RIGS[kind]
+        frames, poses = measured_frames(true, LINES, 20, rng)
+        for option, name, wanted in (
+                ('principal_point', 'cy', 2.0), ('focal_length', 'focal', -0.003)):
+            camera = true.camera
+            camera = (replace(camera, cy=camera.cy - wanted) if name == 'cy' else
+                      replace(camera, fx=camera.fx / (1 + wanted), fy=camera.fy / (1 + wanted)))
+            parameters = RigParameters(
+                replace(disturbed(true, rng), camera=camera), LINES,
+                CalibrationOptions(**{option: True}))
+            found = adjust(parameters, Observations.stack(frames, LINES), poses)
+            k = parameters.index[name]
+            sigma = np.sqrt(found.covariance[k, k])
+            assert sigma < 0.7 * parameters.spread[k]
+            assert abs(found.theta[k] - wanted) < 3.0 * sigma
 
 
 def test_outliers_do_not_move_the_rig():

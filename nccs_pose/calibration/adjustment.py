@@ -14,12 +14,11 @@
 
 """Joint refinement of rig and poses over all line measurements.
 
-Minimises sum rho(S / (|dS/du| sigma)) + |theta / spread|^2 over theta and every frame's pose by
-Levenberg's method. The weight 1 / |dS/du| is recomputed at every step and held within it, as in
-an iteratively re-weighted least-squares problem; its own derivative is of the order of the
-curve's change of scale, thousandths of that of S. The normal matrix is an arrow: 3 x 3 pose
-blocks that meet only in the rig's block, so the poses are eliminated one by one and the cost is
-linear in their number.
+Minimises sum rho(e / sigma) + |theta / spread|^2 over theta and every frame's pose by Levenberg's
+method, e the distance in the image from a measured pixel to its line's curve (see
+:mod:`nccs_pose.calibration.problem`). The normal matrix is an arrow: 3 x 3 pose blocks that meet
+only in the rig's block, so the poses are eliminated one by one and the cost is linear in their
+number.
 """
 
 from __future__ import annotations
@@ -28,8 +27,8 @@ from dataclasses import dataclass
 
 from nccs_pose.calibration.observations import Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
+from nccs_pose.calibration.problem import Linearisation, Problem
 from nccs_pose.calibration.pulls import pull_statistics
-from nccs_pose.calibration.sensitivity import IncidentRays, side_sensitivity
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array
 import numpy as np
@@ -39,25 +38,10 @@ from numpy.typing import NDArray
 _CAUCHY = 2.385
 _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
 _BEYOND = 3.0  # standard deviations: scatter of the pulls that is no chance
+_FEET = 2  # how often the feet of the perpendiculars are dropped
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
 # A pose is somewhere within 100 m and 10 rad: keeps every block regular, moves nothing.
 _VAGUE = np.diag([1e-4, 1e-4, 1e-2])
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """Whitened residuals and their derivatives at one rig and its poses.
-
-    :ivar residual: e (N,), no unit; with sigma = 1 px it is pixels.
-    :ivar hit: which points count (N,).
-    :ivar by_pose: (N, 3).
-    :ivar by_rig: (N, P).
-    """
-
-    residual: Array
-    hit: NDArray[np.bool_]
-    by_pose: Array
-    by_rig: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,37 +149,6 @@ class Adjustment:
     iterations: int
 
 
-class Problem:
-    """Observations, free parameters, and what does not change between steps."""
-
-    def __init__(
-        self, parameters: RigParameters, observations: Observations, *, check: bool = True,
-    ) -> None:
-        if check and len(observations) < 3 * observations.frames + len(parameters):
-            raise CalibrationError(
-                f'{len(observations)} points in {observations.frames} frames cannot fix '
-                f'{len(parameters)} numbers of the rig and a pose for each frame')
-        self.parameters = parameters
-        self.observations = observations
-        self.slices = observations.slices()
-        # With a camera that stays as it is, pixels look along the same rays at every step.
-        camera_moves = {'cx', 'focal'} & parameters.index.keys()
-        self._incident = None if camera_moves else IncidentRays.of(
-            parameters.rough.rig.camera, observations.pixels)
-
-    def linearise(self, theta: Array, poses: Array) -> Linearisation:
-        """Residuals and derivatives at theta (P,) and poses (F, 3).
-
-        :raises GeometryError: if there can be no such rig.
-        """
-        model, obs = self.parameters.model(theta), self.observations
-        s = side_sensitivity(model.rig, model.line_map, poses, obs, self._incident)
-        scale = s.hit / (s.slope * obs.sigma)
-        columns = self.parameters.columns(theta, s, model, obs.pixels, obs.line)
-        return Linearisation(
-            s.side * scale, s.hit, s.pose * scale[:, None], columns * scale[:, None])
-
-
 def adjust(
     parameters: RigParameters, observations: Observations, poses: Array, *,
     theta: Array | None = None, max_iterations: int = 60,
@@ -203,7 +156,7 @@ def adjust(
     """Refine the rig and the poses together.
 
     First under Cauchy's loss with its scale estimated from the residuals, then by least squares
-    over the inliers, from which the covariance comes.
+    over the inliers with derivatives on the curves, from which the covariance comes.
 
     :param poses: where to begin, T_map_base of every frame (F, 3).
     :param theta: where to begin, deviation from the rough rig (P,); None: at it.
@@ -220,8 +173,11 @@ def adjust(
         raise CalibrationError(
             f'only {int(inlier.sum())} of {len(observations)} points lie on the lines that they '
             'should be on: wrong map, wrong mirror, or a rough rig too far off')
-    theta, poses, terms, finished, more = _descend(
-        problem, theta, poses, inlier, False, max_iterations)
+    for _ in range(_FEET):
+        problem.drop_feet(theta, poses)
+        theta, poses, terms, finished, more = _descend(
+            problem, theta, poses, inlier, False, max_iterations)
+        used += more
     e = terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
     chi2 = float(e @ e) / degrees
@@ -236,7 +192,7 @@ def adjust(
     return Adjustment(
         parameters.model(theta, with_rim=True), theta, poses, information,
         posterior(information, parameters.spread), gain, terms.residual, inlier, scale, chi2,
-        shared, ended and finished, used + more)
+        shared, ended and finished, used)
 
 
 def posterior(information: Array, spread: Array) -> Array:

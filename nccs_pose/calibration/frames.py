@@ -24,11 +24,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nccs_pose.calibration.adjustment import ArrowSystem, posterior, Problem
+from nccs_pose.calibration.adjustment import ArrowSystem, posterior
 from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
+from nccs_pose.calibration.problem import Problem
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 from numpy.typing import NDArray

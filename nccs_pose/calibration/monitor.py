@@ -40,11 +40,12 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
-from nccs_pose.calibration.adjustment import ArrowSystem, Problem
+from nccs_pose.calibration.adjustment import ArrowSystem
 from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
+from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
@@ -184,8 +185,9 @@ class CalibrationMonitor:
         observations = Observations.stack(
             [frame.thinned(self.options.points_per_line)], self._parameters.rough.line_map)
         problem = Problem(self._parameters, observations, check=False)
-        here = pose.as_array()
-        terms = problem.linearise(np.zeros(len(self._parameters)), here[None])
+        here, as_told = pose.as_array(), np.zeros(len(self._parameters))
+        problem.drop_feet(as_told, here[None])
+        terms = problem.linearise(as_told, here[None])
         if terms.hit.sum() < 12:
             return
         scale = max(1.0, 1.4826 * float(np.median(np.abs(terms.residual[terms.hit]))))

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from nccs_pose.calibration.adjustment import adjust, Adjustment, ArrowSystem, Problem
+from nccs_pose.calibration.adjustment import adjust, Adjustment, ArrowSystem
 from nccs_pose.calibration.first_poses import first_poses
 from nccs_pose.calibration.frames import advice, choose, frame_information, Terrain
 from nccs_pose.calibration.gauge import (
@@ -32,6 +32,7 @@ from nccs_pose.calibration.judgement import judge, Judgement
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigModel, RigParameters
+from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.rough_start import Start, start
 from nccs_pose.errors import CalibrationError
 from nccs_pose.geometry.lines import LineMap
