@@ -194,6 +194,24 @@ def test_the_bound_falls_with_pixels_and_rises_with_noise() -> None:
         cramer_rao_bound(rays[on_floor], d[on_floor], mu[on_floor], POSE)
 
 
+@pytest.mark.parametrize(
+    'change, word',
+    [
+        ({'sigma': 0.0}, 'sigma'),
+        ({'sigma': np.nan}, 'sigma'),
+        ({'directions': 0.0}, 'unit length'),
+        ({'directions': np.nan}, 'directions of the lines'),
+        ({'moments': np.inf}, 'moments of the lines'),
+    ])
+def test_a_bound_without_meaning_is_refused_by_name(change: dict, word: str) -> None:
+    pixels, d, mu, _ = scene(TABLE_ONE['spherical'])
+    rays = TABLE_ONE['spherical'].back_project(pixels)
+    d = d if 'directions' not in change else np.full_like(d, change['directions'])
+    mu = mu if 'moments' not in change else np.full_like(mu, change['moments'])
+    with pytest.raises(EstimationError, match=word):
+        cramer_rao_bound(rays, d, mu, POSE, sigma=change.get('sigma', 1.0))
+
+
 def test_a_lines_direction_along_the_cameras_x_makes_g2_singular() -> None:
     """Q is proportional to d'_y for a floor line: x = P / Q has no meaning where it is zero."""
     rig = TABLE_ONE['spherical']
@@ -229,6 +247,7 @@ def test_a_tilted_mounting_is_treated_as_straight() -> None:
         (lambda p, d, mu: (p[:2], d[:2], mu[:2]), '2 pixels'),
         (lambda p, d, mu: (p, d[:-1], mu), 'directions of shape'),
         (lambda p, d, mu: (p * np.nan, d, mu), 'pixels are not all finite'),
+        (lambda p, d, mu: (p, d * 0.0, mu), 'unit length'),
         (lambda p, d, mu: (np.vstack([p[:-1], [[1e6, 1e6]]]), d, mu), 'miss the mirror'),
     ])
 def test_impossible_input_is_refused_by_name(change, word: str) -> None:

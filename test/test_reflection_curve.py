@@ -300,5 +300,10 @@ def test_impossible_lines_are_refused_by_name() -> None:
         ReflectionCurve(mirror, cop, np.array([0.0, np.nan, 0.0]), np.ones(3))
     with pytest.raises(GeometryError, match='finite'):
         paper_polynomials(mirror, cop, [np.inf, 0.0, 0.0], [0.0, 0.0, 1.0])
+    for make in (paper_polynomials, ReflectionCurve):
+        with pytest.raises(GeometryError, match='inside the mirror'):
+            make(mirror, np.array([0.0, 0.0, 0.02]), np.ones(3), np.ones(3))
+        with pytest.raises(GeometryError, match='x must be 0'):
+            make(mirror, np.array([0.01, 0.0, 0.06]), np.ones(3), np.ones(3))
     with pytest.raises(GeometryError, match='spacing'):
         trace_line(TABLE_ONE['spherical'], Line([0, 1, 0], [1, 1, 0]), spacing=0.0)

@@ -21,7 +21,7 @@ the whitened residual at the true pose and the pixels without noise.
 from __future__ import annotations
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.residual import whitened_residual
+from nccs_pose.estimation.residual import check_rays_and_lines, whitened_residual
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -44,12 +44,15 @@ def cramer_rao_bound(
     :param pose: the true T_map_base.
     :param sigma: standard deviation of the pixels, in each of u and v, px.
     :param sigma_world: standard deviation of each coordinate of the world's points, metres.
-    :raises EstimationError: if these pixels do not fix the pose at all.
+    :raises EstimationError: if these pixels do not fix the pose at all, and as
+        :func:`nccs_pose.estimation.residual.check_rays_and_lines` does.
     """
+    sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
+    check_rays_and_lines(rays, directions, moments, sigma)
     _, jacobian = whitened_residual(rays, directions, moments, pose, sigma, sigma_world)
     information = jacobian.T @ jacobian
     values = np.linalg.eigvalsh(information)
-    if not np.isfinite(values).all() or values[0] <= 1e-12 * values[-1]:
+    if values[0] <= 1e-12 * values[-1]:
         raise EstimationError(
             f'no bound: {len(rays)} pixels leave a direction of the pose unobserved')
     return np.linalg.inv(information)

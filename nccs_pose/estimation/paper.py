@@ -231,8 +231,8 @@ def paper_estimate(
     :param start: first guess of T_map_base; the paper takes the previous frame's pose.
     :param use_g2: whether to demand g_2 = 0.
     :param normalised: divide each point's gamma_r by the size of its coefficients.
-    :raises EstimationError: with fewer than three pixels, with a pixel that misses the mirror, or
-        for values that are not finite.
+    :raises EstimationError: with fewer than three pixels, with a pixel that misses the mirror,
+        for a direction that is not of unit length, or for values that are not finite.
     """
     pixels, directions, moments = (
         np.asarray(v, dtype=float) for v in (pixels, directions, moments))
@@ -243,6 +243,8 @@ def paper_estimate(
                 f'{name} of shape {value.shape}: expected ({len(pixels)}, {columns})')
         if not np.isfinite(value).all():
             raise EstimationError(f'{name} are not all finite')
+    if not (np.abs(np.linalg.norm(directions, axis=1) - 1.0) < 1e-6).all():
+        raise EstimationError('directions are not all of unit length')
     if len(pixels) < 3:
         raise EstimationError(f'{len(pixels)} pixels cannot fix a pose; at least 3 are needed')
     points, hit = rig.mirror_points(pixels)

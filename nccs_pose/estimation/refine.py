@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import math
 
 from nccs_pose.errors import EstimationError
+from nccs_pose.estimation.residual import check_rays_and_lines
 from nccs_pose.estimation.side_form import SideForm
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
@@ -119,7 +120,9 @@ def refine(
         not finite.
     """
     sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
-    _check(rays, directions, moments, sigma)
+    if len(rays) < 3:
+        raise EstimationError(f'{len(rays)} pixels cannot fix a pose; at least 3 are needed')
+    check_rays_and_lines(rays, directions, moments, sigma)
     expected, known = _prior(start, prior, attitude_sigma)
     form = SideForm(rays, directions, moments, sigma, sigma_world, len(expected) == 6)
     problem = _Problem(form, expected, known)
@@ -149,25 +152,6 @@ def refine(
     return Refinement(
         Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
         attitude, e, inlier, scale, converged and finished)
-
-
-def _check(rays: Rays, directions: Array, moments: Array, sigma: Array) -> None:
-    if len(rays) < 3:
-        raise EstimationError(f'{len(rays)} pixels cannot fix a pose; at least 3 are needed')
-    if not rays.hit.all():
-        raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
-    for name, value in (
-            ('ray directions', rays.direction), ('ray moments', rays.moment),
-            ('derivatives of ray directions', rays.direction_jacobian),
-            ('derivatives of ray moments', rays.moment_jacobian),
-            ('directions of the lines', directions), ('moments of the lines', moments),
-            ('sigma', sigma)):
-        if not np.isfinite(value).all():
-            raise EstimationError(f'{name}: not all finite')
-    if not sigma.min() > 0.0:
-        raise EstimationError(f'sigma = {sigma.min()} px: must be positive')
-    if np.abs(np.einsum('ni,ni->n', directions, directions) - 1.0).max() > 1e-6:
-        raise EstimationError('directions of the lines: not all of unit length')
 
 
 def _prior(

@@ -25,11 +25,38 @@ Rays are in base_link, lines in the map; the pose is T_map_base.
 
 from __future__ import annotations
 
+from nccs_pose.errors import EstimationError
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
 
 _Z = np.array([0.0, 0.0, 1.0])
+
+
+def check_rays_and_lines(rays: Rays, directions: Array, moments: Array, sigma: Array) -> None:
+    """Refuse what no residual can be made of.
+
+    :param directions: of the lines in the map (N, 3).
+    :param moments: their moments (N, 3), metres.
+    :param sigma: standard deviations of the pixels (N,), px.
+    :raises EstimationError: for a ray that missed the mirror, a direction that is not of unit
+        length, a sigma that is not positive, or a value that is not finite.
+    """
+    if not rays.hit.all():
+        raise EstimationError(f'{int((~rays.hit).sum())} of {len(rays)} pixels miss the mirror')
+    for name, value in (
+            ('ray directions', rays.direction), ('ray moments', rays.moment),
+            ('derivatives of ray directions', rays.direction_jacobian),
+            ('derivatives of ray moments', rays.moment_jacobian),
+            ('directions of the lines', directions), ('moments of the lines', moments),
+            ('sigma', sigma)):
+        if not np.isfinite(value).all():
+            raise EstimationError(f'{name}: not all finite')
+    if not (sigma > 0.0).all():
+        raise EstimationError(f'sigma = {sigma.min()} px: must be positive')
+    length2 = np.einsum('ni,ni->n', directions, directions)
+    if not (np.abs(length2 - 1.0) < 1e-6).all():
+        raise EstimationError('directions of the lines: not all of unit length')
 
 
 def lines_in_base(directions: Array, moments: Array, pose: Pose2) -> tuple[Array, Array]:

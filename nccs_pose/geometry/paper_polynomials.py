@@ -159,13 +159,18 @@ def paper_polynomials(
     """The paper's polynomials for the line q + lambda d (3,), (3,) in the mirror frame.
 
     :param cop: o = (0, o_y, o_z) (3,), in the unit of length of mirror and q (metres, or any).
-    :raises GeometryError: if d is zero or anything is not finite.
+    :raises GeometryError: if d is zero, anything is not finite, or o is off the plane x = 0 or
+        inside the mirror.
     """
     o, q, d = (np.asarray(v, dtype=float) for v in (cop, q, d))
     if not all(np.isfinite(v).all() and v.shape == (3,) for v in (o, q, d)):
         raise GeometryError(f'cop {o}, q {q} and d {d} must be three finite numbers each')
     if not d.any():
         raise GeometryError('the line has the direction d = 0')
+    if o[0] != 0.0:
+        raise GeometryError(f'cop {o.tolist()}: its x must be 0')
+    if mirror.encloses(o):
+        raise GeometryError(f'cop {o.tolist()} lies inside the mirror')
     base = mirror_polynomials(mirror, o)
     y, z, one = _poly((1, 0, 1.0)), _poly((0, 1, 1.0)), _poly((0, 0, 1.0))
 

@@ -68,7 +68,8 @@ class ReflectionCurve:
     :ivar cop: o = (0, o_y, o_z) (3,) in the mirror frame, metres.
     :ivar point: q (3,), a point of the line in the mirror frame, metres.
     :ivar direction: d (3,), unit.
-    :raises GeometryError: if a vector is not finite, or d is zero.
+    :raises GeometryError: if a vector is not finite, d is zero, or the centre of projection is off
+        the plane x = 0 or inside the mirror.
     """
 
     mirror: QuadricMirror
@@ -85,6 +86,10 @@ class ReflectionCurve:
         length = np.linalg.norm(self.direction)
         if length == 0.0:
             raise GeometryError('the line has the direction d = 0')
+        if self.cop[0] != 0.0:
+            raise GeometryError(f'cop {self.cop.tolist()}: its x must be 0')
+        if self.mirror.encloses(self.cop):
+            raise GeometryError(f'cop {self.cop.tolist()} lies inside the mirror')
         object.__setattr__(self, 'direction', self.direction / length)
 
     @classmethod
