@@ -152,7 +152,7 @@ def test_every_pose_on_a_soccer_field_is_found(repository, table: FloorTable) ->
         best = candidates[0].score
         equal = [c.pose for c in candidates if c.score > best - 0.05]
         assert any(_near(s @ pose, other) for s in symmetries for other in equal)
-        explains = score_pose(pose, strips, field, table)
+        explains, _ = score_pose(pose, strips, field, table)
         assert explains > best - 0.05
 
 
@@ -183,7 +183,7 @@ def test_one_strip_and_parallel_strips_give_no_pose(table: FloorTable) -> None:
     assert global_candidates(parallel, line_map, table) == ()
     assert global_candidates(strips[:1], line_map, table) == ()
     assert global_candidates((), line_map, table) == ()
-    assert score_pose(Pose2(0.0, 0.0, 0.0), (), line_map, table) == 0.0
+    assert score_pose(Pose2(0.0, 0.0, 0.0), (), line_map, table) == (0.0, 0.0)
 
 
 def test_strips_that_are_no_lines_do_not_hide_the_pose(table: FloorTable) -> None:
@@ -219,10 +219,13 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
     line_map = _random_map(np.random.default_rng(14), 6)
     pose = Pose2(0.1, 0.2, -0.7)
     strips = _strips(line_map, pose, np.random.default_rng(15))
-    there = score_pose(pose, strips, line_map, table)
+    there, claimed = score_pose(pose, strips, line_map, table)
     assert there > 0.9
+    assert claimed == pytest.approx(1.0)
     for step in (Pose2(0.5, 0.0, 0.0), Pose2(0.0, -0.6, 0.0), Pose2(0.0, 0.0, 0.5)):
-        assert score_pose(pose @ step, strips, line_map, table) < there - 0.3
+        score, part = score_pose(pose @ step, strips, line_map, table)
+        assert score < there - 0.3
+        assert part < claimed
 
 
 # ---------------------------------------------------------------- symmetries of maps
@@ -287,7 +290,7 @@ def _segments(
     if hide is not None:
         image[:, hide] = 205
     mask = chromatic_mask(image, 'green', 4.5, 0.05, 31)
-    return floor_segments(find_blobs(mask & table.region, 60), table, WIDTH, 'green')
+    return floor_segments(find_blobs(mask & table.region, 400), table, WIDTH, 'green')
 
 
 def _lies_on(strip: FloorSegment, line: Line, pose: Pose2) -> float:
@@ -316,6 +319,21 @@ def test_touching_tapes_are_split(table: FloorTable) -> None:
     assert len(strips) == 2
     for line in corner:
         assert sum(_lies_on(s, line, HERE) < 0.05 for s in strips) == 1
+
+
+def test_a_blob_over_a_whole_court_is_split_into_its_lines(table: FloorTable) -> None:
+    """A rectangle is a single blob, and so is the line across its middle."""
+    court = LineMap((*_rectangle(3.0, 2.2), _line((0.0, -1.1), (0.0, 1.1))))
+    rng = np.random.default_rng(4)
+    found, others = 0, 0
+    for _ in range(10):
+        pose = Pose2(*rng.uniform(-0.7, 0.7, 2), rng.uniform(-np.pi, np.pi))
+        strips = _segments(court, pose, table)
+        on = [sum(_lies_on(s, line, pose) < 0.12 for s in strips) for line in court]
+        found += sum(n > 0 for n in on)
+        others += len(strips) - sum(on)
+    assert found >= 47
+    assert others <= 5
 
 
 def test_a_tape_cut_in_pieces_is_joined(table: FloorTable) -> None:

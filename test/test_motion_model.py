@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry
+from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 from nccs_pose.simulation.motion import integrate_twist, Twist
 import numpy as np
@@ -26,6 +26,10 @@ import pytest
 
 SECOND = 10**9
 START = Pose2(3.0, -2.0, 2.9)
+
+
+def _track(stamp_ns: int, pose: Pose2, covariance: np.ndarray, seen_ns: int | None = None) -> Track:
+    return Track(stamp_ns, pose, covariance, None, stamp_ns if seen_ns is None else seen_ns)
 
 
 def _difference(a: Pose2, b: Pose2) -> tuple[float, float]:
@@ -109,8 +113,9 @@ def test_a_steady_motion_is_predicted_from_two_poses() -> None:
     for turn, moved_limit in ((0.0, 1e-12), (0.6, 1e-3)):
         twist = Twist(0.4, turn)
         poses = [integrate_twist(START, twist, 0.1 * k) for k in range(3)]
-        prediction = by_velocity(
-            poses[0], 0, poses[1], 1e-6 * np.eye(3), SECOND // 10, SECOND // 5)
+        before, last = (
+            _track(k * SECOND // 10, poses[k], 1e-6 * np.eye(3)) for k in (0, 1))
+        prediction = by_velocity(before, last, SECOND // 5)
         assert prediction is not None
         moved, turned = _difference(prediction.pose, poses[2])
         assert moved <= moved_limit
@@ -118,11 +123,52 @@ def test_a_steady_motion_is_predicted_from_two_poses() -> None:
 
 
 def test_an_old_velocity_is_not_believed() -> None:
-    args = (START, 0, START @ Pose2(0.1, 0.0, 0.0), np.eye(3))
-    assert by_velocity(*args, SECOND // 2, SECOND) is not None
-    assert by_velocity(*args, SECOND // 2, 2 * SECOND) is None
-    assert by_velocity(*args, 3 * SECOND, 3 * SECOND + 1) is None
-    assert by_velocity(*args, SECOND // 2, SECOND // 2) is None, 'no time has passed'
+    before, last = _track(0, START, np.eye(3)), START @ Pose2(0.1, 0.0, 0.0)
+    assert by_velocity(before, _track(SECOND // 2, last, np.eye(3)), SECOND) is not None
+    assert by_velocity(before, _track(SECOND // 2, last, np.eye(3)), 2 * SECOND) is None
+    assert by_velocity(before, _track(3 * SECOND, last, np.eye(3)), 3 * SECOND + 1) is None
+    still = _track(SECOND // 2, last, np.eye(3))
+    assert by_velocity(before, still, SECOND // 2) is None, 'no time has passed'
+
+
+def test_without_a_velocity_the_robot_may_have_gone_anywhere_near() -> None:
+    last = _track(SECOND, START, 1e-6 * np.eye(3))
+    prediction = by_velocity(None, last, SECOND + SECOND // 10)
+    assert prediction is not None
+    assert prediction.pose == START
+    # A robot at 1 m/s and 2 rad/s is one deviation away.
+    moved, _, turned = np.sqrt(np.diag(prediction.carried))
+    assert moved == pytest.approx(0.1, rel=0.01)
+    assert turned == pytest.approx(0.2, rel=0.01)
+
+
+def test_a_direction_out_of_sight_grows_uncertain_since_it_was_last_seen() -> None:
+    before = _track(0, START, 1e-6 * np.eye(3))
+    deviations = []
+    for seen_ns in (SECOND, SECOND // 2, SECOND // 4):
+        last = _track(SECOND, START @ Pose2(0.1, 0.0, 0.0), 1e-6 * np.eye(3), seen_ns)
+        prediction = by_velocity(before, last, SECOND + SECOND // 10)
+        assert prediction is not None
+        deviations.append(float(np.sqrt(prediction.carried[0, 0])))
+    assert deviations[0] < deviations[1] < deviations[2]
+    # Half of 1 m/s^2 for 0.85 s, and as much again from the velocity's own second.
+    assert deviations[2] == pytest.approx(0.5 * 0.85 * 1.85, rel=0.01)
+    unseen = _track(SECOND, START, 1e-6 * np.eye(3), 0)
+    assert by_velocity(before, unseen, SECOND + SECOND // 10) is None
+
+
+def test_the_floor_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
+    """Against the solution of both problems written out: x observed, y not."""
+    carried = np.diag([0.03, 0.05, 0.01]) ** 2
+    prediction = Prediction(START, carried, True)
+    image = np.diag([1.0 / 0.001**2, 0.0, 1.0 / 0.002**2])
+    solved = np.linalg.inv(image + np.linalg.inv(prediction.covariance))
+    for multiple in (1.0, 4.0):
+        got = prediction.without_floor(multiple * solved, solved)
+        assert np.sqrt(got[1, 1]) == pytest.approx(0.05, rel=1e-9)
+        # What the image sees keeps its own uncertainty: never less for having a good prediction.
+        assert np.sqrt(got[0, 0]) == pytest.approx(np.sqrt(multiple) * 0.001, rel=0.01)
+        assert np.sqrt(got[2, 2]) == pytest.approx(np.sqrt(multiple) * 0.002, rel=0.05)
 
 
 def test_the_covariance_of_a_prediction_is_that_of_many_predictions() -> None:
@@ -147,11 +193,10 @@ def test_what_a_prediction_may_be_off_by_grows_with_the_motion() -> None:
         np.sqrt(np.diag(by_odometry(START, zero, still, Pose2(d, 0.0, d)).covariance))
         for d in (0.0, 0.2, 1.0)]
     assert (np.diff(sizes, axis=0) > 0.0).all()
-    # Wheels that slip by a tenth are usual; the prediction must leave room for that.
-    assert sizes[2][0] > 0.1
-    last = START @ Pose2(0.1, 0.0, 0.0)
+    # What wheels get wrong is a few hundredths of a metre's run.
+    assert 0.03 < sizes[2][0] < 0.06
+    before, last = _track(0, START, zero), _track(SECOND // 2, START @ Pose2(0.1, 0.0, 0.0), zero)
     soon, later = (
-        by_velocity(START, 0, last, zero, SECOND // 2, SECOND // 2 + dt)
-        for dt in (SECOND // 10, SECOND // 2))
+        by_velocity(before, last, SECOND // 2 + dt) for dt in (SECOND // 10, SECOND // 2))
     assert soon is not None and later is not None
     assert (np.diag(later.covariance) > np.diag(soon.covariance)).all()

@@ -97,12 +97,17 @@ def global_candidates(
 
 def score_pose(
     pose: Pose2, segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable,
-) -> float:
-    """The score that :func:`global_candidates` would give a pose, 0 to 1."""
+) -> tuple[float, float]:
+    """The score that :func:`global_candidates` would give a pose, and the strips' part in it.
+
+    :returns: the score, 0 to 1, and the fraction of the strips' pixels that lie on map lines;
+        both 0 where there are no strips.
+    """
     if not segments:
-        return 0.0
+        return 0.0, 0.0
     scorer = _Scorer(segments, _FloorLines.of(line_map), table)
-    return float(scorer.score(pose.as_array()[None])[0])
+    at = pose.as_array()[None]
+    return float(scorer.score(at)[0]), float(scorer.claimed(at)[0])
 
 
 def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
@@ -117,13 +122,14 @@ def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
     alike &= np.abs(line_map.lengths[:, None] - line_map.lengths) < _SAME_TAPE
     # Every such motion turns about the tapes' common centre of gravity.
     centre = line_map.lengths @ ends.mean(axis=1) / line_map.lengths.sum()
+    x, y = centre.tolist()
     heading = np.arctan2(line_map.directions[:, 1], line_map.directions[:, 0])
     # The tape that may lie on the fewest others leaves the fewest turns to try.
     first = int(alike.sum(axis=1).argmin())
     turns = (heading[alike[first]] - heading[first])[:, None] + [0.0, np.pi]
     found = [Pose2(0.0, 0.0, 0.0)]
     for turn in np.sort(turns.ravel() % (2.0 * np.pi)):
-        motion = Pose2(*centre, float(turn)) @ Pose2(*-centre, 0.0)
+        motion = Pose2(x, y, float(turn)) @ Pose2(-x, -y, 0.0)
         moved = motion.apply(ends.reshape(-1, 2)).reshape(ends.shape)
         off = np.minimum(
             *(np.linalg.norm(moved[:, None] - there, axis=3).max(axis=2)

@@ -21,8 +21,9 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+import itertools
 
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
@@ -41,8 +42,14 @@ _LONGEST_GAP = 0.8
 _BESIDE = 0.15
 # So much beside a strip, of what lies in it, is no crossing tape any more.
 _MOST_BESIDE = 0.35
-# Lines drawn through random pairs of pixels of a blob that is no single line.
-_PAIRS = 16
+# A blob is a single line when no more than this part of it lies beside; of one that is, every
+# so many-th pixel is enough.
+_MISFIT = 0.15
+_THINNED = 4
+# Of one that is not, lines are drawn through so many of its pixels and their neighbours within
+# this distance (m, and footprints), and through as many pairs of its pixels.
+_SEEDS = 24
+_NEIGHBOURS = (0.35, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,10 @@ class _Points:
     blob: NDArray[np.intp]
     weight: Array
 
+    def __getitem__(self, index: NDArray[np.intp] | slice) -> _Points:
+        return _Points(
+            self.floor[index], self.jacobian[index], self.blob[index], self.weight[index])
+
     def tolerance(self, normal: Array, width: float) -> Array:
         """How far from a tape's midline its pixels may be (..., P), for normals (..., 2)."""
         # |J^T n|^2 = n^T (J J^T) n: one matrix product for all normals and points.
@@ -109,7 +120,11 @@ def floor_segments(
         return ()
     floor, jacobian = table.floor(segmentation.pixels)
     points = _Points(floor, jacobian, segmentation.label, segmentation.weight)
-    normals, offsets = _candidates(points, width)
+    normals, offsets, kept = _candidates(points, width)
+    points, floor, pixels = points[kept], floor[kept], segmentation.pixels[kept]
+    # What is left of a thinned blob stands for all of it.
+    share = np.bincount(segmentation.label) / np.maximum(np.bincount(points.blob), 1)
+    points = replace(points, weight=points.weight * share[points.blob])
     free = np.ones(len(floor), dtype=bool)
     segments: list[FloorSegment] = []
     distance = np.abs(normals @ floor.T - offsets[:, None])
@@ -127,7 +142,7 @@ def floor_segments(
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
             segments.append(_segment(
-                points, segmentation.pixels, inside, normal, offset, colour))
+                points, pixels, inside, normal, offset, colour))
         else:
             # What is left of a solid must not pass for a thinner thing.
             free &= ~beside
@@ -136,30 +151,59 @@ def floor_segments(
     return tuple(segments)
 
 
-def _candidates(points: _Points, width: float) -> tuple[Array, Array]:
-    """Lines (C, 2), (C,) that may run through the blobs: each blob's own, and pairs of its pixels."""
-    normals, offsets = [], []
+def _candidates(
+    points: _Points, width: float,
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Lines (C, 2), (C,) that may run through the blobs, and the points that are needed for them.
+
+    Each blob's own line, and where that does not fit, those through some of its pixels.
+    """
+    normals: list[Array] = []
+    offsets: list[float] = []
+    kept = []
     bounds = np.flatnonzero(np.diff(points.blob, prepend=-1, append=-1))
     rng = np.random.default_rng(0)
-    for first, last in zip(bounds[:-1], bounds[1:]):
+    for first, last in itertools.pairwise(bounds.tolist()):
+        part = points[first:last]
         if last - first < 3:
             continue
-        chosen = slice(first, last)
-        normal, offset = _fit(points.floor[chosen], _precision(points.jacobian[chosen], width))
+        normal, offset = _fit(part.floor, _precision(part.jacobian, width))
         normals.append(normal)
         offsets.append(offset)
-        floor = points.floor[chosen]
-        part = _Points(floor, points.jacobian[chosen], points.blob[chosen], points.weight[chosen])
-        misfit = np.abs(floor @ normal - offset) > part.tolerance(normal, width)
-        if misfit.mean() > 0.15 and last - first >= _LEAST_PIXELS:
-            pair = floor[rng.integers(0, last - first, (_PAIRS, 2))]
-            along = pair[:, 1] - pair[:, 0]
-            length = np.linalg.norm(along, axis=1)
-            pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
-            across = np.column_stack([-along[:, 1], along[:, 0]])
-            normals.extend(across)
-            offsets.extend(np.einsum('ni,ni->n', across, pair[:, 0]))
-    return np.array(normals).reshape(-1, 2), np.array(offsets)
+        misfit = np.abs(part.floor @ normal - offset) > part.tolerance(normal, width)
+        if misfit.mean() <= _MISFIT or last - first < _LEAST_PIXELS:
+            kept.append(np.arange(first, last, 1 if last - first < 60 else _THINNED))
+            continue
+        kept.append(np.arange(first, last))
+        for normal, offset in (*_through_neighbours(part, width), *_through_pairs(part, rng)):
+            normals.append(normal)
+            offsets.append(offset)
+    index = np.concatenate(kept) if kept else np.zeros(0, dtype=np.intp)
+    return np.array(normals).reshape(-1, 2), np.array(offsets), index
+
+
+def _through_neighbours(part: _Points, width: float) -> list[tuple[Array, float]]:
+    """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
+    lines = []
+    precision = _precision(part.jacobian, width)
+    footprint = np.sqrt(0.5 * (part.spread[0] + part.spread[2]))
+    for k in range(0, len(part.floor), max(1, len(part.floor) // _SEEDS)):
+        reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint[k]
+        offset = part.floor - part.floor[k]
+        near = np.einsum('pi,pi->p', offset, offset) < reach**2
+        if near.sum() >= 3:
+            lines.append(_fit(part.floor[near], precision[near]))
+    return lines
+
+
+def _through_pairs(part: _Points, rng: np.random.Generator) -> list[tuple[Array, float]]:
+    """Lines through random pairs of a blob's pixels."""
+    pair = part.floor[rng.integers(0, len(part.floor), (_SEEDS, 2))]
+    along = pair[:, 1] - pair[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    return list(zip(across, np.einsum('ni,ni->n', across, pair[:, 0]).tolist()))
 
 
 def _precision(jacobian: Array, width: float) -> Array:

@@ -16,25 +16,33 @@
 
 Each image is first laid on the pose expected of it. Where that fails, or where there is no pose
 to expect, the whole image is searched for every pose that explains it; a single one is taken,
-several are said to be ambiguous, none leaves the robot lost. What cannot be trusted is not given.
+several are carried on as hypotheses until the images decide, none leaves the robot lost. What
+cannot be trusted is not given.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import time
-import zlib
 
-from nccs_pose.errors import FrameRefusedError
+from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.alignment import Aligner, Alignment, close
-from nccs_pose.estimation.association import same_pose
-from nccs_pose.estimation.estimate import Candidate, Estimate, Quality, StageTimes, State
+from nccs_pose.estimation.association import map_symmetries, same_pose
+from nccs_pose.estimation.estimate import Candidate, Estimate, quality_of, StageTimes, State
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction
+from nccs_pose.estimation.hypotheses import (
+    ambiguity,
+    carried,
+    confronted,
+    Hypothesis,
+    LEAST_IMAGES,
+)
+from nccs_pose.estimation.judge import Found, Judge, OPEN, settled_doubts
+from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.verdict import contradiction, objection
+from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -43,34 +51,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Poses of a search that are laid on the image itself.
-_TRIED = 3
+_TRIED = 6
 # A search's poses lie within this of the truth in the image, px.
 _SEARCH_BAND = 5.0
 # Of a search's poses only those count that score this fraction of the best.
 _WORTH_TRYING = 0.6
 # A pose elsewhere must beat the tracked one by this much to unseat it.
 _BETTER = 0.15
-# A direction of the pose is open when its deviation exceeds this, metres and radians.
-_OPEN = 0.5
+# A pose on fewer than three lines has to be where it is expected, within so many deviations.
+_FEW_GATE = 3.0
+# Odometry carries a pose on only while it explains this part of what looks like a line.
+_CLAIMED = 0.5
+# A pose given by hand or from the last run decides among those within so many deviations.
+_PRIOR_GATE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Track:
-    """The last pose that an image gave."""
+class _Sifted:
+    """What a search of the whole image leaves.
 
-    stamp_ns: int
-    pose: Pose2
-    covariance: Array
-    odometry: Pose2 | None
+    :ivar held: poses that explain the image, best first.
+    :ivar hidden: poses that would, if something hid the lines that they miss.
+    :ivar objections: against the others, the best first.
+    """
 
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A pose with what it explains of the image."""
-
-    alignment: Alignment
-    claimed: float
-    score: float
+    held: list[Found]
+    hidden: list[Candidate]
+    objections: list[Objection]
 
 
 class _Stopwatch:
@@ -97,10 +104,11 @@ class Localiser:
         :raises GeometryError: if the rig sees no floor.
         :raises VisionError: if the map names a colour that is none.
         """
-        self._rig = rig
         self._map = line_map
         self._table = FloorTable(rig, options.reach)
+        self._symmetries = map_symmetries(line_map)[1:]
         self._odometry = Odometry()
+        self._admission = Admission(rig.camera, self._odometry, options.clock_jump)
         self.update_options(options)
         self.reset()
 
@@ -112,24 +120,26 @@ class Localiser:
         self.options = options
         self._aligner = Aligner(self._table, self._map, options)
         self._searcher = Searcher(self._table, self._map, options)
+        self._judge = Judge(self._searcher, self._table, self._map, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""
         self._odometry.clear()
-        self._last_stamp: int | None = None
-        self._last_image = 0
+        self._admission.forget()
         self.relocalise()
 
     def relocalise(self) -> None:
-        """Forget the pose; the next image is searched as if the robot had just been switched on."""
-        self._track: _Track | None = None
-        self._before: _Track | None = None
+        """Forget the pose; the next image is searched as if the robot was just switched on."""
+        self._track: Track | None = None
+        self._before: Track | None = None
         self._prior: tuple[Pose2, Array] | None = None
         self._ever_tracked = False
         self._frames_since_check = 0
         self._colours = self._aligner.nominal_colours
-        # A pose that an image showed against the prediction, and the odometry then.
-        self._rumour: tuple[Pose2, Pose2 | None] | None = None
+        # Poses among which no image has decided yet, and where the wheels were then.
+        self._open: tuple[Hypothesis, ...] = ()
+        self._open_odometry: Pose2 | None = None
+        self._doubts: frozenset[int] = frozenset()
 
     def set_prior(self, pose: Pose2, covariance: Array) -> None:
         """Give a hypothesis, as by hand or from the last run: it decides between equal poses.
@@ -151,52 +161,20 @@ class Localiser:
         :param image: (H, W, 3) uint8 BGR, of the calibration's size.
         :raises FrameRefusedError: if the frame must not be used; the cause says why.
         """
-        self._admit(stamp_ns, image)
+        if not self._admission.admit(stamp_ns, image):
+            self._odometry.clear()
+            self.relocalise()
         watch = _Stopwatch()
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
-        found: _Found | None = None
+        against: Objection | None = None
         if prediction is not None:
-            found = self._follow(image, prediction, watch)
-        if found is not None:
-            return self._tracking(stamp_ns, found, (), 0.0, watch, 'the pose explains the image')
-        return self._search(stamp_ns, image, prediction, watch)
-
-    def _admit(self, stamp_ns: int, image: NDArray[np.uint8]) -> None:
-        camera = self._rig.camera
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise FrameRefusedError(
-                'image_type', f'image of shape {image.shape} and type {image.dtype} is not '
-                '(height, width, 3) uint8')
-        if image.shape[:2] != (camera.height, camera.width):
-            raise FrameRefusedError(
-                'image_size', f'image is {image.shape[1]} x {image.shape[0]} pixels, the '
-                f'calibration is for {camera.width} x {camera.height}')
-        last = self._last_stamp
-        if last is not None and stamp_ns < last:
-            if last - stamp_ns <= self.options.clock_jump * 1e9:
-                raise FrameRefusedError(
-                    'out_of_order', f'stamp {stamp_ns} ns is {(last - stamp_ns) * 1e-9:.3f} s '
-                    'before that of the last image')
-            self.reset()
-        if last == stamp_ns:
-            raise FrameRefusedError('duplicate_stamp', f'stamp {stamp_ns} ns was there before')
-        # Rows far apart tell a frozen camera from one that stands still in its own noise.
-        content = zlib.crc32(np.ascontiguousarray(image[::16]))
-        if content == self._last_image and self._moved_since(self._last_stamp, stamp_ns):
-            raise FrameRefusedError(
-                'frozen_image', 'the image has not changed by a bit although the robot has moved')
-        self._last_image = content
-        self._last_stamp = stamp_ns
-
-    def _moved_since(self, before_ns: int | None, after_ns: int) -> bool:
-        if before_ns is None:
-            return False
-        before, after = self._odometry.at(before_ns), self._odometry.at(after_ns)
-        if before is None or after is None:
-            return False
-        step = before.inverse() @ after
-        return bool(np.hypot(step.x, step.y) > 0.005 or abs(step.yaw) > 0.005)
+            followed = self._follow(image, prediction, watch)
+            if isinstance(followed, Found):
+                return self._tracking(
+                    stamp_ns, followed, prediction, watch, 'the pose explains the image')
+            against = followed
+        return self._search(stamp_ns, image, prediction, against, watch)
 
     def _predict(self, stamp_ns: int) -> Prediction | None:
         track, before = self._track, self._before
@@ -205,182 +183,219 @@ class Localiser:
         now = self._odometry.at(stamp_ns)
         if track.odometry is not None and now is not None:
             return by_odometry(track.pose, track.covariance, track.odometry, now)
-        if before is None:
-            return None
-        return by_velocity(
-            before.pose, before.stamp_ns, track.pose, track.covariance, track.stamp_ns, stamp_ns)
+        return by_velocity(before, track, stamp_ns)
 
     def _follow(
         self, image: NDArray[np.uint8], prediction: Prediction, watch: _Stopwatch,
-    ) -> _Found | None:
-        """Lay the predicted pose on the image; None where the whole image must be searched."""
+    ) -> Found | Objection | None:
+        """Lay the predicted pose on the image; no pose where the whole must be searched."""
         prior = (prediction.pose, prediction.covariance)
+        against: Objection | None = None
         for reach in (0.0, self.options.band):
             alignment = self._aligner.align(
                 image, prediction.pose, self._colours, reach=reach, prior=prior)
             watch.lap('measure')
-            if alignment is not None and self._expected(alignment, prediction) and not objection(
-                    alignment, self.options, expected=True):
+            if alignment is None or not self._expected(alignment.pose, alignment, prediction):
+                continue
+            against = self._judge.objection(image, alignment, self._doubts, expected=True)
+            if against is None:
                 break
         else:
-            return None
+            return against
         self._frames_since_check += 1
         due = self._frames_since_check >= self.options.check_every
         if not (due or alignment.missing or len(alignment.lines) == 1):
-            return _Found(alignment, float('nan'), alignment.explained)
+            return Found(alignment, float('nan'), alignment.explained)
         self._frames_since_check = 0
         segments = self._searcher.segments(image)
         watch.lap('detect')
-        if contradiction(alignment, segments, self._map):
-            return None
-        here = self._searcher.score(alignment.pose, segments)
+        against = contradiction(alignment, segments, self._map)
+        if against is not None:
+            return against
+        here, claimed = self._searcher.score(alignment.pose, segments)
         elsewhere = self._searcher.candidates(segments)
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):
-            return None
-        return _Found(alignment, here, alignment.explained)
+            return Objection('another pose explains the image better')
+        return Found(alignment, claimed, alignment.explained)
 
-    def _expected(self, alignment: Alignment, prediction: Prediction | None) -> bool:
+    def _expected(self, pose: Pose2, alignment: Alignment, prediction: Prediction | None) -> bool:
         """Whether a pose is where the prediction says, within the gate."""
-        return prediction is not None and close(
-            alignment.pose, prediction.pose, prediction.covariance + alignment.covariance,
-            self.options.innovation_gate)
+        if prediction is None:
+            return False
+        gate = self.options.innovation_gate
+        if lines_used(alignment) < 3:
+            gate = min(gate, _FEW_GATE)
+        return close(pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
-        watch: _Stopwatch,
+        against: Objection | None, watch: _Stopwatch,
     ) -> Estimate:
+        """Look for every pose that explains the image, and take the one that is left, if any."""
         segments = self._searcher.segments(image)
         watch.lap('detect')
         candidates = self._searcher.candidates(segments)
         watch.lap('associate')
-        found, objections = self._try_all(image, candidates, segments, prediction, watch)
-        if not found:
-            return self._without_pose(
-                stamp_ns, prediction, _what_is_missing(segments, objections), watch)
-        ambiguity = found[1].score / found[0].score if len(found) > 1 else 0.0
-        poses = tuple(Candidate(f.alignment.pose, f.score) for f in found)
-        if ambiguity <= self.options.ambiguity_ratio:
-            if not self._confirmed(stamp_ns, found[0], prediction):
-                # Neither place is to be believed now: the odometry carries nothing on either.
-                return Estimate(
-                    stamp_ns, State.LOST,
-                    'the image shows another place than expected; the next one has to agree',
-                    candidates=poses, times=watch.times)
-            return self._tracking(
-                stamp_ns, found[0], poses, ambiguity, watch, 'found by searching the whole image')
-        chosen = self._decide(found, prediction)
-        if chosen is not None:
-            return self._tracking(
-                stamp_ns, chosen, poses, ambiguity, watch,
-                'several poses explain the image; the one expected was taken')
-        self._track = self._before = None
-        return Estimate(
-            stamp_ns, State.AMBIGUOUS,
-            f'{len(found)} poses explain the image about equally well '
-            f'(the second scores {ambiguity:.2f} of the first)',
-            candidates=poses,
-            quality=Quality(explained=found[0].alignment.explained, claimed=found[0].claimed,
-                            ambiguity=ambiguity),
-            times=watch.times)
-
-    def _try_all(
-        self, image: NDArray[np.uint8], candidates: tuple[Candidate, ...],
-        segments: tuple[FloorSegment, ...], prediction: Prediction | None, watch: _Stopwatch,
-    ) -> tuple[list[_Found], list[str]]:
-        """Lay the best candidates on the image itself.
-
-        :returns: what holds there, best first, and why the others do not.
-        """
-        found: list[_Found] = []
-        objections: list[str] = []
-        for candidate in candidates[:_TRIED]:
-            if candidate.score < _WORTH_TRYING * candidates[0].score:
-                break
-            alignment = self._aligner.align(
-                image, candidate.pose, self._aligner.nominal_colours, reach=_SEARCH_BAND)
-            watch.lap('measure')
-            if alignment is None:
-                continue
-            words = objection(
-                alignment, self.options, expected=self._expected(alignment, prediction))
-            words = words or contradiction(alignment, segments, self._map)
-            if words:
-                objections.append(words)
-                continue
-            if unobserved_directions(
-                    alignment.refinement.information, alignment.pose, limit=_OPEN):
-                continue
-            if any(same_pose(alignment.pose, f.alignment.pose) for f in found):
-                continue
-            score = self._searcher.score(alignment.pose, segments)
-            found.append(_Found(alignment, score, np.sqrt(score * alignment.explained)))
-        return sorted(found, key=lambda f: -f.score), objections
-
-    def _confirmed(self, stamp_ns: int, found: _Found, prediction: Prediction | None) -> bool:
-        """Whether a pose is expected, or two images in a row agree on it against the prediction.
-
-        Who has been carried away is still there in the next image; a mistake seldom is.
-        """
-        pose = found.alignment.pose
         now = self._odometry.at(stamp_ns)
-        before, self._rumour = self._rumour, (pose, now)
-        if prediction is None or self._expected(found.alignment, prediction):
-            return True
-        if before is None:
-            return False
-        there, odometry = before
-        if odometry is not None and now is not None:
-            there = there @ (odometry.inverse() @ now)
-        return same_pose(there, pose)
+        hypotheses = carried(self._open, self._open_odometry, now)
+        sifted = self._sift(image, candidates, hypotheses, segments, prediction, watch)
+        held = sifted.held
+        if not held:
+            trusted = self._trusted(image, segments, watch)
+            if trusted is not None:
+                return self._tracking(
+                    stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
+            against = against or (sifted.objections[0] if sifted.objections else None)
+            if against is not None and against.line is not None:
+                self._doubts |= {against.line}
+            words = against.words if against is not None else _what_is_missing(segments)
+            return self._without_pose(stamp_ns, prediction, segments, words, watch)
+        chosen = self._decide(held, prediction)
+        if chosen is not None:
+            words = 'found by searching the whole image'
+            if len(held) > 1:
+                words = 'several poses explain the image; the one expected was taken'
+            return self._tracking(stamp_ns, chosen, None, watch, words, held)
+        first = prediction is None and not self._open
+        hypotheses = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
+        if lines_used(held[0].alignment) < 3:
+            hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
+        self._open, self._open_odometry = hypotheses, now
+        best = hypotheses[0]
+        if ambiguity(hypotheses) <= self.options.ambiguity_ratio and (
+                first or len(best.scores) >= LEAST_IMAGES):
+            found = next(f for f in held if f.alignment.pose == best.pose)
+            return self._tracking(
+                stamp_ns, found, None, watch, 'found by searching the whole image', held)
+        return self._undecided(stamp_ns, held, watch)
 
-    def _decide(self, found: list[_Found], prediction: Prediction | None) -> _Found | None:
-        """The one pose that a prior or the prediction expects, if it is one."""
-        expected = self._prior
-        if expected is None and prediction is not None:
-            expected = (prediction.pose, prediction.covariance)
-        if expected is None:
+    def _sift(
+        self, image: NDArray[np.uint8], candidates: tuple[Candidate, ...],
+        hypotheses: tuple[Hypothesis, ...], segments: tuple[FloorSegment, ...],
+        prediction: Prediction | None, watch: _Stopwatch,
+    ) -> _Sifted:
+        """Lay hypotheses, the best candidates and their twins on the image itself."""
+        worth = _WORTH_TRYING * candidates[0].score if candidates else 0.0
+        starts = [(h.pose, 1.0, self.options.band) for h in hypotheses]
+        starts += [(c.pose, c.score, _SEARCH_BAND) for c in candidates[:_TRIED]]
+        sifted = _Sifted([], [], [])
+        seen: list[Pose2] = []
+        # What holds adds its twins to the end of the queue.
+        for start, promise, reach in starts:
+            # A pose scores the root of this at most.
+            best = max((f.score for f in sifted.held), default=0.0)
+            if promise < max(worth, (self.options.ambiguity_ratio * best) ** 2):
+                continue
+            if any(same_pose(start, pose) for pose in seen):
+                continue
+            alignment = self._aligner.align(
+                image, start, self._aligner.nominal_colours, reach=reach)
+            watch.lap('measure')
+            if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
+                continue
+            seen.append(alignment.pose)
+            found = self._judge.found(
+                image, alignment, segments, self._doubts,
+                expected=self._expected(alignment.pose, alignment, prediction))
+            if isinstance(found, Objection):
+                sifted.objections.append(found)
+                if found.hidden:
+                    score, _ = self._searcher.score(alignment.pose, segments)
+                    sifted.hidden.append(Candidate(alignment.pose, score))
+                continue
+            sifted.held.append(found)
+            starts += [(s @ found.alignment.pose, 1.0, _SEARCH_BAND) for s in self._symmetries]
+        sifted.held.sort(key=lambda f: -f.score)
+        return sifted
+
+    def _trusted(
+        self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,
+    ) -> tuple[Found, Prediction] | None:
+        """The pose that was given, where too little is in view to find it without."""
+        if self._prior is None:
             return None
-        near = [f for f in found if close(
-            f.alignment.pose, expected[0], expected[1] + f.alignment.covariance, 4.0)]
+        given = Prediction(*self._prior, by_odometry=False)
+        followed = self._follow(image, given, watch)
+        if not isinstance(followed, Found):
+            return None
+        _, claimed = self._searcher.score(followed.alignment.pose, segments)
+        return (replace(followed, claimed=claimed), given) if claimed >= _CLAIMED else None
+
+    def _decide(self, held: list[Found], prediction: Prediction | None) -> Found | None:
+        """The one pose that a prior or the prediction expects, if it is one of the best."""
+        good = [f for f in held if f.score >= self.options.ambiguity_ratio * held[0].score]
+        if self._prior is not None:
+            pose, covariance = self._prior
+            near = [f for f in good if close(
+                f.alignment.pose, pose, covariance + f.alignment.covariance, _PRIOR_GATE)]
+        else:
+            near = [f for f in good if self._expected(f.alignment.pose, f.alignment, prediction)]
         return near[0] if len(near) == 1 else None
 
     def _tracking(
-        self, stamp_ns: int, found: _Found, candidates: tuple[Candidate, ...], ambiguity: float,
-        watch: _Stopwatch, reason: str,
+        self, stamp_ns: int, found: Found, prior: Prediction | None, watch: _Stopwatch,
+        reason: str, held: list[Found] | None = None,
     ) -> Estimate:
-        alignment = found.alignment
-        refinement = alignment.refinement
-        self._before = self._track
-        self._track = _Track(
-            stamp_ns, alignment.pose, alignment.covariance, self._odometry.at(stamp_ns))
+        """Take a pose over.
+
+        :param prior: the prediction that was weighed in with it, if one was.
+        :param held: all poses that explain the image, best first, if it was searched.
+        """
+        alignment, covariance = found.alignment, found.alignment.covariance
+        if prior is not None:
+            covariance = prior.without_floor(covariance, alignment.refinement.covariance)
+        unobserved = unobserved_directions(
+            alignment.refinement.information, alignment.pose, limit=OPEN)
+        seen_ns = stamp_ns
+        if unobserved and self._track is not None:
+            seen_ns = self._track.seen_ns
+        # No velocity leads across a jump.
+        self._before = None if self._open else self._track
+        self._track = Track(
+            stamp_ns, alignment.pose, covariance, self._odometry.at(stamp_ns), seen_ns)
         self._colours = alignment.colours
         self._prior = None
-        self._rumour = None
+        self._open, self._open_odometry = (), None
+        self._doubts = settled_doubts(self._doubts, alignment)
         self._ever_tracked = True
-        sigma = alignment.points.sigma
-        unobserved = unobserved_directions(refinement.information, alignment.pose, limit=_OPEN)
-        residual = refinement.residual[refinement.inlier]
-        told = sigma / max(float(np.sqrt(np.mean(residual**2))), 1e-9)
-        quality = Quality(
-            lines_used=len(alignment.lines), points_used=len(alignment.points),
-            residual_px=float(np.sqrt(np.mean((residual * told) ** 2))),
-            expected_px=float(np.sqrt(np.mean(told**2))),
-            explained=alignment.explained, claimed=found.claimed, ambiguity=ambiguity,
-            unobserved=tuple(u.words for u in unobserved))
+        ranked = held or [found]
+        quality = quality_of(
+            alignment.refinement, alignment.points, alignment.explained, found.claimed,
+            ranked[1].score / ranked[0].score if len(ranked) > 1 else 0.0, unobserved)
         watch.lap('refine')
         return Estimate(
-            stamp_ns, State.TRACKING, reason, alignment.pose, alignment.covariance,
-            candidates or (Candidate(alignment.pose, found.score),), alignment.points, quality,
-            watch.times)
+            stamp_ns, State.TRACKING, reason, alignment.pose, covariance,
+            tuple(Candidate(f.alignment.pose, f.score) for f in ranked), alignment.points,
+            quality, watch.times)
+
+    def _undecided(self, stamp_ns: int, held: list[Found], watch: _Stopwatch) -> Estimate:
+        """Say which poses may be right, and give none of them."""
+        hypotheses = self._open
+        poses = tuple(Candidate(h.pose, h.mean) for h in hypotheses)
+        ratio = ambiguity(hypotheses)
+        best = held[0].alignment
+        quality = quality_of(
+            best.refinement, best.points, best.explained, held[0].claimed, ratio, ())
+        if ratio > self.options.ambiguity_ratio:
+            state, words = State.AMBIGUOUS, (
+                f'{len(poses)} poses explain the image about equally well (the second scores '
+                f'{ratio:.2f} of the first)')
+        else:
+            state = State.LOST if self._ever_tracked else State.SEARCHING
+            words = 'the image shows another place than expected; the next one has to agree'
+        return Estimate(
+            stamp_ns, state, words, candidates=poses, quality=quality, times=watch.times)
 
     def _without_pose(
-        self, stamp_ns: int, prediction: Prediction | None, missing: str, watch: _Stopwatch,
+        self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
+        missing: str, watch: _Stopwatch,
     ) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
         track = self._track
-        if track is not None and prediction is not None and prediction.by_odometry:
+        if track is not None and prediction is not None and prediction.by_odometry and not (
+                self._shaken(prediction, segments)):
             age = (stamp_ns - track.stamp_ns) * 1e-9
             deviation = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
             if age <= self.options.coast_time and deviation <= self.options.coast_sigma:
@@ -389,13 +404,21 @@ class Localiser:
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
                     prediction.covariance, times=watch.times)
         state = State.LOST if self._ever_tracked else State.SEARCHING
-        return Estimate(stamp_ns, state, missing, times=watch.times)
+        return Estimate(
+            stamp_ns, state, missing, times=watch.times,
+            candidates=tuple(Candidate(h.pose, h.mean) for h in self._open))
 
 
-def _what_is_missing(segments: tuple[FloorSegment, ...], objections: list[str]) -> str:
+    def _shaken(self, prediction: Prediction, segments: tuple[FloorSegment, ...]) -> bool:
+        """Whether an image shows another place than expected, now or since the last pose."""
+        if self._open:
+            return True
+        _, claimed = self._searcher.score(prediction.pose, segments)
+        return bool(segments) and claimed < _CLAIMED
+
+
+def _what_is_missing(segments: tuple[FloorSegment, ...]) -> str:
     """Why an image gives no pose, in words."""
-    if objections:
-        return objections[0]
     if not segments:
         return 'no line-like strip in the image'
     if len(segments) == 1:

@@ -27,12 +27,33 @@ _LONGEST_GAP_NS = 250_000_000
 # Without odometry a velocity is believed for so long, s.
 _LONGEST_COAST = 1.0
 _KEPT = 4000
-# What a prediction may be off by: a floor, and a part of the motion (odometry); an
-# acceleration (constant velocity). The floor keeps the image, not the prediction, in charge.
+# What a prediction may be off by beside the motion's own part, metres and rad: it keeps the image,
+# not the prediction, in charge.
 _FLOOR_SIGMA = (0.02, 0.015)
-_ODOMETRY_SHARE = 0.1
-_YAW_PER_METRE = 0.05
+# What wheels gain in error over the first metre or radian; it grows with the square root.
+_PER_METRE = (0.03, 0.03)
+_YAW_PER_RADIAN = 0.05
+# Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
+_SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The last pose that an image gave.
+
+    :ivar stamp_ns: of the image.
+    :ivar pose: T_map_base.
+    :ivar covariance: of (x, y, yaw) (3, 3).
+    :ivar odometry: T_odom_base then; None without odometry.
+    :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
+    """
+
+    stamp_ns: int
+    pose: Pose2
+    covariance: Array
+    odometry: Pose2 | None
+    seen_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +61,35 @@ class Prediction:
     """A pose expected before its image is looked at.
 
     :ivar pose: T_map_base.
-    :ivar covariance: of (x, y, yaw) (3, 3).
+    :ivar carried: covariance of (x, y, yaw) (3, 3), by what moved it.
     :ivar by_odometry: whether wheels say so, or only the last velocity.
     """
 
     pose: Pose2
-    covariance: Array
+    carried: Array
     by_odometry: bool
+
+    @property
+    def covariance(self) -> Array:
+        """What the image is held against (3, 3): never so narrow that it would rule the image."""
+        return self.carried + FLOOR
+
+    def without_floor(self, covariance: Array, solved: Array) -> Array:
+        """A covariance (3, 3) after the image, with what the floor brought in taken out again.
+
+        With the gain W = solved prior^-1 the solve gives W prior W^T + the image's part. Where
+        the image says nothing, W is 1, and what is left of the pose's error is the carried one.
+
+        :param covariance: of the pose: a multiple of the solve's, and more.
+        :param solved: of the solve, which had :attr:`covariance` as its prior.
+        """
+        gain = solved @ np.linalg.inv(self.covariance)
+        multiple = max(1.0, float(np.trace(covariance) / np.trace(solved)))
+        narrowed = covariance - gain @ (multiple * self.covariance - self.carried) @ gain.T
+        return narrowed if np.linalg.eigvalsh(narrowed)[0] > 0.0 else covariance
+
+
+FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])
 
 
 class Odometry:
@@ -89,25 +132,34 @@ class Odometry:
 def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two stamps."""
     step = before.inverse() @ after
-    distance = float(np.hypot(step.x, step.y))
-    sigma = _FLOOR_SIGMA[0] + _ODOMETRY_SHARE * distance
-    sigma_yaw = (_FLOOR_SIGMA[1] + _ODOMETRY_SHARE * abs(step.yaw) + _YAW_PER_METRE * distance)
+    distance, angle = float(np.hypot(step.x, step.y)), abs(step.yaw)
+    sigma = _PER_METRE[0] * np.sqrt(distance)
+    sigma_yaw = np.hypot(_PER_METRE[1] * np.sqrt(distance), _YAW_PER_RADIAN * np.sqrt(angle))
     return Prediction(pose @ step, _carried(pose, covariance, step, sigma, sigma_yaw), True)
 
 
-def by_velocity(
-    before: Pose2, before_ns: int, last: Pose2, covariance: Array, last_ns: int, stamp_ns: int,
-) -> Prediction | None:
-    """Carry a pose on by the velocity between the last two; None when that is too long ago."""
-    dt, past = (stamp_ns - last_ns) * 1e-9, (last_ns - before_ns) * 1e-9
-    if not 0.0 < dt <= _LONGEST_COAST or not 0.0 < past <= _LONGEST_COAST:
+def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction | None:
+    """Carry a pose on by the velocity between the last two; None when that is too long ago.
+
+    A direction that no image has fixed for a while is as uncertain as any acceleration since
+    then could make it; without a velocity, as any speed could.
+    """
+    dt, blind = (stamp_ns - last.stamp_ns) * 1e-9, (stamp_ns - last.seen_ns) * 1e-9
+    if not 0.0 < dt <= blind <= _LONGEST_COAST:
         return None
-    twist = before.inverse() @ last
+    if before is None:
+        sigma, sigma_yaw = (speed * blind for speed in _SPEED)
+        return Prediction(last.pose, _carried(
+            last.pose, last.covariance, Pose2(0.0, 0.0, 0.0), sigma, sigma_yaw), False)
+    past = (last.stamp_ns - before.stamp_ns) * 1e-9
+    if not 0.0 < past <= _LONGEST_COAST:
+        return None
+    twist = before.pose.inverse() @ last.pose
     share = dt / past
     step = Pose2(share * twist.x, share * twist.y, share * float(wrap_angle(twist.yaw)))
-    sigma = _FLOOR_SIGMA[0] + 0.5 * _ACCELERATION[0] * dt * (dt + past)
-    sigma_yaw = _FLOOR_SIGMA[1] + 0.5 * _ACCELERATION[1] * dt * (dt + past)
-    return Prediction(last @ step, _carried(last, covariance, step, sigma, sigma_yaw), False)
+    sigma, sigma_yaw = (0.5 * a * blind * (blind + past) for a in _ACCELERATION)
+    return Prediction(
+        last.pose @ step, _carried(last.pose, last.covariance, step, sigma, sigma_yaw), False)
 
 
 def _carried(

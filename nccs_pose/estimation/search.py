@@ -28,7 +28,8 @@ from nccs_pose.vision.segment import chromatic_mask, find_blobs, hsv_mask, Segme
 import numpy as np
 from numpy.typing import NDArray
 
-_PIXELS_PER_BLOB = 60
+# Enough for a blob over all lines of a field at once.
+_PIXELS_PER_BLOB = 400
 
 
 class Searcher:
@@ -70,6 +71,6 @@ class Searcher:
         """Poses that explain the strips, best first."""
         return global_candidates(segments, self._map, self._table)
 
-    def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> float:
-        """How well a pose explains the strips, on the candidates' scale."""
+    def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
+        """How well a pose explains the strips, 0 to 1, and which part of them it explains."""
         return score_pose(pose, segments, self._map, self._table)

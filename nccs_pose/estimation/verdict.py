@@ -16,43 +16,117 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
-from nccs_pose.geometry.pose import Pose2
+from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 
+# A pose rests on a line when it does on this part of the line's stations.
+_RESTS = 0.25
 # A strip this near a missing line (m) and this parallel to it (rad) is that line, moved.
 _NEAR = 0.6
 _PARALLEL = 0.12
 # A strip closer than this to a map line lies on it, metres beyond its own footprint.
 _ON = 0.06
+# A whole line lies off its place when its mean is this many standard deviations from zero.
+_EVIDENT = 4.0
+# Few lines leave little redundancy. Residuals so many times the noise of the image, and larger
+# than this (px), say then that they are not those lines, or not seen by this rig: by two, by three.
+_UNLIKE_NOISE = {2: (5.0, 0.0), 3: (3.0, 0.3)}
+
+
+@dataclass(frozen=True)
+class Objection:
+    """Why a pose is not to be believed.
+
+    :ivar words: the reason.
+    :ivar line: the map line that speaks against it, by its index; None where none does.
+    :ivar hidden: whether the pose may still be right, if something hides what should be seen.
+    """
+
+    words: str
+    line: int | None = None
+    hidden: bool = False
+
+
+def lines_used(alignment: Alignment) -> int:
+    """How many lines a pose rests on."""
+    return int((np.nan_to_num(alignment.support) >= _RESTS).sum())
 
 
 def objection(
-    alignment: Alignment, options: LocaliserOptions, *, expected: bool,
-) -> str:
-    """Why a pose is not to be believed, in words; empty if it is.
+    alignment: Alignment, line_map: LineMap, options: LocaliserOptions, *, expected: bool,
+) -> Objection | None:
+    """What the pose's own lines say against it; None if nothing.
 
     :param expected: whether a prediction agrees with it. Two lines fix a pose without any
         redundancy, so what should be seen besides them has to be there, or to be expected.
     """
     if alignment.explained < options.least_explained:
-        return f'only {100.0 * alignment.explained:.0f} % of the predicted line pixels are there'
+        return Objection(
+            f'only {100.0 * alignment.explained:.0f} % of the predicted line pixels are there')
     if alignment.misfit > options.largest_misfit:
-        return (f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not '
-                'fit the image')
-    if len(alignment.lines) < 3 and alignment.missing and not expected:
-        return (f'it rests on {len(alignment.lines)} lines and {len(alignment.missing)} more '
-                'should be in view')
-    return ''
+        return Objection(
+            f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not fit the '
+            'image')
+    mean, deviation = _line_offsets(alignment, len(line_map))
+    off = np.abs(mean) > np.maximum(options.largest_misfit, _EVIDENT * deviation)
+    if off.any():
+        k = int(np.where(off, np.abs(mean), 0.0).argmax())
+        return Objection(
+            f'{_name(line_map, k)} lies {abs(mean[k]):.1f} px off: the rig or the map does not '
+            'fit the image', line=k)
+    used = lines_used(alignment)
+    residual, told = _residuals(alignment)
+    scale, size = (float(np.sqrt(np.mean(np.square(e)))) for e in (residual, residual * told))
+    if used <= 3:
+        times, least = _UNLIKE_NOISE[max(used, 2)]
+        if scale > times and size > least:
+            return Objection(
+                f'it rests on {used} lines, and they lie {size:.1f} px off where the noise of the '
+                f'image makes {size / scale:.2f} px')
+    if used < 3 and alignment.missing and not expected:
+        return Objection(
+            f'it rests on {used} lines and {len(alignment.missing)} more should be in view',
+            hidden=True)
+    return None
+
+
+def _line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
+    """Mean offset of each whole line (L,) and its standard deviation, px; 0 where unused.
+
+    The deviation comes from the line's own scatter: a line that lies off as a whole must not
+    pass for noise.
+    """
+    label = alignment.points.label
+    residual, told = _residuals(alignment)
+    offset, weight = residual * told, 1.0 / told**2
+    total = np.maximum(np.bincount(label, weight, minlength=lines), 1e-12)
+    mean = np.bincount(label, weight * offset, minlength=lines) / total
+    scatter = np.bincount(label, weight * (offset - mean[label]) ** 2, minlength=lines)
+    count = np.maximum(np.bincount(label, minlength=lines) - 1, 1)
+    return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)
+
+
+def _residuals(alignment: Alignment) -> tuple[Array, Array]:
+    """Residuals of the inliers, whitened (N,), and the noise that they were whitened by, px."""
+    residual = alignment.refinement.residual[alignment.refinement.inlier]
+    # The points' sigma is as it turned out.
+    return residual, alignment.points.sigma / max(float(np.sqrt(np.mean(residual**2))), 1e-9)
+
+
+def _name(line_map: LineMap, k: int) -> str:
+    return f'line {line_map[k].name or f"number {k}"}'
 
 
 def contradiction(
     alignment: Alignment, segments: tuple[FloorSegment, ...], line_map: LineMap,
-) -> str:
-    """Whether a missing line is seen somewhere else, in words; empty if not.
+) -> Objection | None:
+    """Whether a missing line is seen somewhere else; None if not.
 
     An occluded line is nowhere. A line beside its place says that the map, the rig or the pose
     is wrong, and the pixels cannot tell which.
@@ -63,9 +137,10 @@ def contradiction(
                 continue
             offset = _beside(strip, alignment.pose, line_map[k])
             if offset is not None:
-                name = line_map[k].name or f'number {k}'
-                return f'line {name} is seen {offset:.2f} m beside its place in the map'
-    return ''
+                return Objection(
+                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map',
+                    line=k)
+    return None
 
 
 def _beside(strip: FloorSegment, pose: Pose2, line: Line) -> float | None:

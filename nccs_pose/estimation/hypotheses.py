@@ -1,0 +1,80 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses among which the images have not decided yet, carried on until they do.
+
+Every hypothesis keeps the score of each image that it explained. One that stops explaining what
+others explain is dropped; one that is alone, or clearly the best of all images together, and
+explained two images at least, is chosen. A single lucky image decides nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from nccs_pose.estimation.association import same_pose
+from nccs_pose.geometry.pose import Pose2
+
+# Images that a hypothesis must have explained before it is chosen among several.
+LEAST_IMAGES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A pose that may be the right one.
+
+    :ivar pose: T_map_base at the last image that was looked at.
+    :ivar scores: its score in each image that it explained, 0 to 1.
+    """
+
+    pose: Pose2
+    scores: tuple[float, ...]
+
+    @property
+    def mean(self) -> float:
+        """Mean score."""
+        return sum(self.scores) / len(self.scores)
+
+
+def carried(
+    hypotheses: Sequence[Hypothesis], before: Pose2 | None, now: Pose2 | None,
+) -> tuple[Hypothesis, ...]:
+    """Move hypotheses on by what the wheels did, T_odom_base then and now; else leave them."""
+    if before is None or now is None:
+        return tuple(hypotheses)
+    step = before.inverse() @ now
+    return tuple(replace(h, pose=h.pose @ step) for h in hypotheses)
+
+
+def confronted(
+    hypotheses: Sequence[Hypothesis], held: Sequence[tuple[Pose2, float]],
+) -> tuple[Hypothesis, ...]:
+    """The hypotheses after an image, best first: those that it shows, in their new place.
+
+    :param held: every pose that explains the image, with its score; without any the image
+        decides nothing.
+    """
+    if not held:
+        return tuple(hypotheses)
+    found = []
+    for pose, score in held:
+        scores = next((h.scores for h in hypotheses if same_pose(h.pose, pose)), ())
+        found.append(Hypothesis(pose, (*scores, score)))
+    return tuple(sorted(found, key=lambda h: -h.mean))
+
+
+def ambiguity(hypotheses: Sequence[Hypothesis]) -> float:
+    """Score of the second over that of the best, 0 where there is no second."""
+    return hypotheses[1].mean / hypotheses[0].mean if len(hypotheses) > 1 else 0.0

@@ -1,0 +1,132 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lays poses on images and says which of them hold, and why the others do not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Set
+from dataclasses import dataclass
+
+from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.misplaced import place_beside
+from nccs_pose.estimation.observability import unobserved_directions
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.prediction import BandPredictor
+from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.verdict import contradiction, lines_used, Objection, objection
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.vision.colour import LineColour
+import numpy as np
+from numpy.typing import NDArray
+
+# A line of which the pose rests on less than this part is looked for beside its place.
+_WEAK = 0.5
+# Its stations stand so close then, px.
+_CLOSE = 4.0
+# What was once seen beside its place is believed to be so until it is seen in it; or the pose
+# rests on so many other lines that one of them would show.
+_BEYOND_DOUBT = 4
+# Without a prediction a pose on two lines must explain this fraction of what should be seen and of
+# what is seen, one on three lines that of either; more lines speak for themselves.
+_MOST = 0.85
+# A direction of the pose is open when its deviation exceeds this, metres and radians.
+OPEN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A pose that holds.
+
+    :ivar alignment: as laid on the image.
+    :ivar claimed: fraction of the line-like pixels that it explains; NaN if not looked at.
+    :ivar score: how much it explains altogether, 0 to 1.
+    """
+
+    alignment: Alignment
+    claimed: float
+    score: float
+
+
+class Judge:
+    """Judges poses laid on images of one rig and map."""
+
+    def __init__(
+        self, searcher: Searcher, table: FloorTable, line_map: LineMap, options: LocaliserOptions,
+    ) -> None:
+        self._predictor = BandPredictor(table, line_map)
+        self._searcher = searcher
+        self._table = table
+        self._map = line_map
+        self._options = options
+
+    def objection(
+        self, image: NDArray[np.uint8], alignment: Alignment, doubts: Set[int], *,
+        expected: bool,
+    ) -> Objection | None:
+        """What an image says against a pose that was laid on it; None if nothing.
+
+        :param doubts: lines that were seen beside their place and not in it since.
+        :param expected: whether a prediction agrees with the pose.
+        """
+        found = objection(alignment, self._map, self._options, expected=expected)
+        with np.errstate(invalid='ignore'):
+            weak = np.flatnonzero(alignment.support < _WEAK)
+        if found is not None or len(weak) == 0:
+            return found
+        colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
+        places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
+        bands, _ = self._predictor.bands(places, alignment.pose)
+        for k in weak.tolist():
+            line = self._map[k]
+            offset = place_beside(
+                image, k, bands[bands.label == k], colours[line.colour], self._options.band,
+                alignment, self._map, self._table)
+            name = line.name or f'number {k}'
+            if offset is not None:
+                return Objection(f'line {name} is seen {offset:.1f} px beside its place', line=k)
+            if k in doubts and lines_used(alignment) < _BEYOND_DOUBT:
+                return Objection(
+                    f'line {name} was seen beside its place, and not in it since', line=k)
+        return None
+
+    def found(
+        self, image: NDArray[np.uint8], alignment: Alignment,
+        segments: tuple[FloorSegment, ...], doubts: Set[int], *, expected: bool,
+    ) -> Found | Objection:
+        """Judge a pose by the whole image."""
+        against = (self.objection(image, alignment, doubts, expected=expected)
+                   or contradiction(alignment, segments, self._map))
+        if against is not None:
+            return against
+        score, claimed = self._searcher.score(alignment.pose, segments)
+        if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
+            return Objection('the lines that it rests on do not fix a pose')
+        used = lines_used(alignment)
+        weaker, stronger = sorted((claimed, alignment.explained))
+        least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
+        if not expected and least < _MOST:
+            return Objection(
+                f'it rests on {used} lines and leaves too much unexplained', hidden=True)
+        return Found(alignment, claimed, np.sqrt(score * alignment.explained))
+
+
+def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:
+    """The doubts that are left after a pose that holds."""
+    if lines_used(alignment) >= _BEYOND_DOUBT:
+        return frozenset()
+    # A line out of view (NaN) is no longer doubted: another place, another doubt.
+    return frozenset(k for k in doubts if alignment.support[k] < _WEAK)

@@ -1,0 +1,335 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The localiser's states: what it believes, what it doubts, and what it keeps to itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+import itertools
+import math
+
+from nccs_pose.estimation.association import map_symmetries
+from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.geometry.lines import Line, LineMap
+from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import ideal_scene, Scene
+import numpy as np
+import pytest
+
+PERIOD_NS = 100_000_000
+SCENE = ideal_scene(640, noise=0.02)
+
+
+def _line(start: tuple[float, float], end: tuple[float, float], name: str = '') -> Line:
+    return Line(np.array([*start, 0.0]), np.array([*end, 0.0]), width=0.05, name=name)
+
+
+def _closed(*corners: tuple[float, float]) -> tuple[Line, ...]:
+    return tuple(_line(a, b) for a, b in zip(corners, (*corners[1:], corners[0])))
+
+
+RECTANGLE = LineMap(_closed((-2.0, -1.4), (2.0, -1.4), (2.0, 1.4), (-2.0, 1.4)))
+SQUARE = LineMap(_closed((-1.3, -1.3), (1.3, -1.3), (1.3, 1.3), (-1.3, 1.3)))
+
+
+class Drive:
+    """A robot that takes pictures and counts its wheels, in front of a localiser."""
+
+    def __init__(
+        self, scene: Scene, pose: Pose2, options: LocaliserOptions = LocaliserOptions(),
+        wheels: bool = True, believed: LineMap | None = None,
+    ) -> None:
+        self.scene, self.pose, self.wheels = scene, pose, wheels
+        self.localiser = Localiser(scene.rig, believed or scene.line_map, options)
+        self.stamp, self.odometry, self.pictures = 10**9, Pose2(5.0, -3.0, 1.0), 0
+        # The wheels have stood still for a while.
+        for k in (2, 1):
+            self._count_wheels(self.stamp - k * PERIOD_NS)
+
+    def _count_wheels(self, stamp_ns: int) -> None:
+        if self.wheels:
+            self.localiser.add_odometry(stamp_ns, self.odometry)
+
+    def picture(self) -> np.ndarray:
+        self.pictures += 1
+        return render(self.scene, self.pose, np.random.default_rng(self.pictures))
+
+    def go(
+        self, step: Pose2 = Pose2(0.0, 0.0, 0.0), slip: Pose2 = Pose2(0.0, 0.0, 0.0),
+        change: Callable[[np.ndarray], np.ndarray] = lambda image: image,
+    ) -> Estimate:
+        """Drive a step, of which the wheels do not notice the slip, and ask the localiser."""
+        self.stamp += PERIOD_NS
+        self.pose, self.odometry = self.pose @ step @ slip, self.odometry @ step
+        self._count_wheels(self.stamp)
+        return self.localiser.process(self.stamp, change(self.picture()))
+
+    def error(self, estimate: Estimate) -> np.ndarray:
+        """(x, y, yaw) of the estimate less the truth."""
+        assert estimate.pose is not None
+        error = estimate.pose.as_array() - self.pose.as_array()
+        error[2] = wrap_angle(error[2])
+        return error
+
+    def right(self, estimate: Estimate) -> bool:
+        error = self.error(estimate)
+        return bool(np.hypot(error[0], error[1]) < 0.02 and abs(error[2]) < math.radians(0.5))
+
+
+def _near(a: Pose2, b: Pose2) -> bool:
+    return (math.hypot(a.x - b.x, a.y - b.y) < 0.05
+            and abs(float(wrap_angle(a.yaw - b.yaw))) < 0.03)
+
+
+def _black(image: np.ndarray) -> np.ndarray:
+    """Nothing but noise, of which no two pictures have the same."""
+    return np.random.default_rng(int(image.sum())).integers(0, 3, image.shape).astype(np.uint8)
+
+
+# ---------------------------------------------------------------- start
+
+
+def test_the_first_image_gives_the_pose() -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 2.0))
+    first = drive.go()
+    assert first.state is State.TRACKING
+    assert drive.right(first)
+    assert first.quality.claimed > 0.9
+    assert first.quality.explained > 0.9
+
+
+def test_nothing_in_view_is_searching_and_later_lost() -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 2.0), wheels=False)
+    assert drive.go(change=_black).state is State.SEARCHING
+    assert drive.go().state is State.TRACKING
+    dark = drive.go(change=_black)
+    assert dark.state is State.LOST
+    assert dark.pose is None
+    assert dark.reason == 'no line-like strip in the image'
+
+
+@pytest.mark.parametrize('line_map', [RECTANGLE, SQUARE], ids=['rectangle', 'square'])
+def test_a_symmetric_map_lists_all_its_poses_until_a_prior_decides(line_map: LineMap) -> None:
+    drive = Drive(replace(SCENE, line_map=line_map), Pose2(0.4, 0.3, 0.7))
+    turns = map_symmetries(line_map)
+    assert len(turns) in (2, 4)
+    for _ in range(4):
+        estimate = drive.go(Pose2(0.1, 0.0, 0.2))
+        assert estimate.state is State.AMBIGUOUS
+        assert estimate.pose is None
+        assert len(estimate.candidates) == len(turns)
+        for turn in turns:
+            assert any(_near(turn @ drive.pose, c.pose) for c in estimate.candidates)
+    told = turns[1] @ drive.pose @ Pose2(0.1, -0.05, 0.08)
+    drive.localiser.set_prior(told, np.diag([0.2, 0.2, 0.2]) ** 2)
+    decided = drive.go()
+    assert decided.state is State.TRACKING
+    assert decided.pose is not None
+    assert _near(decided.pose, turns[1] @ drive.pose)
+    # History goes on deciding.
+    for _ in range(3):
+        later = drive.go(Pose2(0.1, 0.0, 0.2))
+        assert later.pose is not None
+        assert _near(later.pose, turns[1] @ drive.pose)
+
+
+def test_driving_on_decides_between_equal_poses() -> None:
+    """A hall whose two ends look the same, but for a stripe that is out of sight at first."""
+    hall = LineMap((
+        *_closed((-3.0, -0.8), (3.0, -0.8), (3.0, 0.8), (-3.0, 0.8)),
+        _line((0.5, -0.7), (0.7, 0.6))))
+    options = LocaliserOptions(reach=1.6)
+    drive = Drive(replace(SCENE, line_map=hall), Pose2(-2.4, 0.1, 0.0), options)
+    first = drive.go()
+    assert first.state is State.AMBIGUOUS
+    twin = Pose2(0.0, 0.0, math.pi) @ drive.pose
+    assert any(_near(drive.pose, c.pose) for c in first.candidates)
+    assert any(_near(twin, c.pose) for c in first.candidates)
+    answers = [drive.go(Pose2(0.15, 0.0, 0.0)) for _ in range(2)]
+    while drive.pose.x < 0.4:
+        answers.append(drive.go(Pose2(0.15, 0.0, 0.0)))
+        if answers[-1].pose is not None:
+            assert drive.right(answers[-1])
+    assert answers[0].pose is None
+    assert answers[-1].state is State.TRACKING
+
+
+# ---------------------------------------------------------------- kidnapping
+
+
+@pytest.mark.parametrize('wheels', [True, False], ids=['wheels', 'no wheels'])
+def test_a_kidnapped_robot_is_found_within_three_images(wheels: bool) -> None:
+    rng = np.random.default_rng(5)
+    drive = Drive(SCENE, Pose2(0.0, 0.0, 0.0), wheels=wheels)
+    for _ in range(3):
+        assert drive.go(Pose2(0.03, 0.0, 0.02)).state is State.TRACKING
+    for _ in range(8):
+        there = Pose2(*rng.uniform(-1.0, 1.0, 2), rng.uniform(-np.pi, np.pi))
+        answers = [drive.go(slip=drive.pose.inverse() @ there)]
+        answers += [drive.go(Pose2(0.03, 0.0, 0.02)) for _ in range(2)]
+        assert all(a.pose is None for a in answers[:-1] if a.state is not State.TRACKING)
+        assert drive.right(answers[-1])
+        # Nothing that was given on the way was the place that it had left.
+        for answer in answers:
+            assert answer.state in (State.TRACKING, State.LOST)
+
+
+def test_what_an_image_showed_elsewhere_is_not_coasted_over() -> None:
+    drive = Drive(SCENE, Pose2(0.5, 0.1, 0.3))
+    for _ in range(3):
+        drive.go()
+    shown = drive.go(slip=Pose2(-0.8, -0.3, 2.5))
+    assert shown.state is State.LOST
+    assert shown.reason.startswith('the image shows another place than expected')
+    assert [_near(c.pose, drive.pose) for c in shown.candidates] == [True]
+    dark = drive.go(change=_black)
+    assert (dark.state, dark.pose) == (State.LOST, None)
+    again = drive.go(Pose2(0.05, 0.0, 0.0))
+    assert again.state is State.TRACKING
+    assert drive.right(again)
+
+
+def test_odometry_bridges_darkness_for_a_while_and_no_longer() -> None:
+    drive = Drive(SCENE, Pose2(-0.5, 0.1, 0.3), LocaliserOptions(coast_time=0.45))
+    for _ in range(3):
+        drive.go()
+    dark = [drive.go(Pose2(0.08, 0.0, 0.05), change=_black) for _ in range(6)]
+    assert [e.state for e in dark] == 4 * [State.COASTING] + 2 * [State.LOST]
+    deviations = [math.sqrt(np.trace(e.covariance[:2, :2])) for e in dark[:4]]
+    assert all(a < b for a, b in itertools.pairwise(deviations))
+    assert dark[3].pose is not None
+    back = drive.go()
+    assert back.state is State.TRACKING
+    assert drive.right(back)
+
+
+def test_a_tracked_pose_that_explains_the_image_is_kept() -> None:
+    """Its twins explain a symmetric map just as well, in every image that is searched."""
+    drive = Drive(
+        replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7), LocaliserOptions(check_every=1))
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    for _ in range(6):
+        assert drive.right(drive.go(Pose2(0.05, 0.0, 0.1)))
+
+
+# ---------------------------------------------------------------- directions left open
+
+# Both go on beyond what can be seen, as all floor lines that end nowhere.
+RAILS = LineMap((_line((-30.0, -0.9), (30.0, -0.9)), _line((-30.0, 1.1), (30.0, 1.1)),
+                 _line((-2.0, -0.9), (-2.0, 1.1)), _line((-2.7, -0.6), (-1.4, 0.5))))
+
+
+def _along_the_rails(seed: int, frames: int) -> tuple[Drive, list[Estimate]]:
+    """From where the end of the track is seen to where only rails are, with noisy wheels."""
+    rng = np.random.default_rng(seed)
+    drive = Drive(replace(SCENE, line_map=RAILS), Pose2(-1.5, 0.0, 0.1),
+                  LocaliserOptions(reach=3.0))
+    answers = [drive.go() for _ in range(2)]
+    step = Pose2(0.12, 0.0, -0.004)
+    for _ in range(frames):
+        # Wheels lose 3 % in every direction, and not the same in each step.
+        noise = 0.008 * rng.standard_normal(3)
+        slip = Pose2(-0.002 + noise[0], 0.3 * noise[1], 0.3 * noise[2])
+        answers.append(drive.go(step, slip))
+    return drive, answers
+
+
+def test_parallel_lines_leave_one_direction_named_and_truly_uncertain() -> None:
+    squares = []
+    for seed in range(6):
+        drive, answers = _along_the_rails(seed, 40)
+        last = answers[-1]
+        assert last.state is State.TRACKING
+        assert [w.replace('-', '') for w in last.quality.unobserved] == [
+            'position along (1.000, 0.000)']
+        assert last.covariance is not None
+        values, vectors = np.linalg.eigh(last.covariance)
+        # The rails run along x.
+        assert abs(vectors[0, 2]) > 0.999
+        assert 0.03 < math.sqrt(values[2]) < 0.5
+        assert math.sqrt(values[1]) < 0.005
+        error = drive.error(last)
+        assert abs(error[1]) < 0.01
+        squares.append(error[0] ** 2 / last.covariance[0, 0])
+    # Chi-squared with six degrees of freedom: 0.05 % and 99.95 %.
+    assert 0.2 < sum(squares) < 24.1
+
+
+def test_without_odometry_an_open_direction_is_not_guessed_for_long() -> None:
+    drive = Drive(replace(SCENE, line_map=RAILS), Pose2(-1.5, 0.0, 0.0),
+                  LocaliserOptions(reach=3.0), wheels=False)
+    answers = [drive.go() for _ in range(2)]
+    answers += [drive.go(Pose2(0.25, 0.0, 0.0)) for _ in range(22)]
+    assert answers[1].state is State.TRACKING
+    assert answers[-1].state is State.LOST
+    blind = [a for a in answers if a.covariance is not None and a.quality.unobserved]
+    deviations = [math.sqrt(a.covariance[0, 0]) for a in blind]
+    assert 5 <= len(blind) <= 11, 'up to a second'
+    assert all(a < b for a, b in itertools.pairwise(deviations))
+    assert deviations[-1] > 0.3
+
+
+def test_a_prior_helps_where_the_lines_in_view_do_not_fix_a_pose() -> None:
+    drive = Drive(
+        replace(SCENE, line_map=RAILS), Pose2(8.0, 0.1, 0.05), LocaliserOptions(reach=3.0))
+    blind = drive.go()
+    assert (blind.state, blind.pose) == (State.SEARCHING, None)
+    assert 'parallel' in blind.reason
+    drive.localiser.set_prior(Pose2(8.15, 0.12, 0.03), np.diag([0.2, 0.05, 0.05]) ** 2)
+    given = drive.go()
+    assert given.state is State.TRACKING
+    assert given.covariance is not None
+    assert 0.15 < math.sqrt(given.covariance[0, 0]) < 0.25
+    error = drive.error(given)
+    assert abs(error[0] - 0.15) < 0.02
+    assert abs(error[1]) < 0.01
+    assert abs(error[2]) < 0.005
+
+
+# ---------------------------------------------------------------- doubt
+
+
+def test_a_line_beside_its_place_is_named_and_no_pose_is_given() -> None:
+    lines = list(SCENE.line_map)
+    shift = np.array([0.15, 0.0, 0.0])
+    wrong = replace(lines[1], start=lines[1].start + shift, end=lines[1].end + shift)
+    believed = LineMap((lines[0], wrong, *lines[2:]))
+    drive = Drive(SCENE, Pose2(0.0, 0.0, 0.4), believed=believed)
+    for _ in range(4):
+        estimate = drive.go(Pose2(0.02, 0.0, 0.1))
+        assert estimate.pose is None
+        assert 'line' in estimate.reason
+        assert ' px ' in estimate.reason or ' m ' in estimate.reason
+
+
+# ---------------------------------------------------------------- the same again
+
+
+def test_the_same_images_give_the_same_bytes() -> None:
+    def run() -> list[bytes]:
+        drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7))
+        answers = [drive.go(Pose2(0.1, 0.0, 0.2)) for _ in range(2)]
+        drive.localiser.set_prior(drive.pose, np.diag([0.2, 0.2, 0.2]) ** 2)
+        answers += [drive.go(Pose2(0.1, 0.0, 0.2)) for _ in range(3)]
+        answers.append(drive.go(Pose2(0.1, 0.0, 0.0), change=_black))
+        return [
+            repr((a.state, a.reason, a.pose, a.candidates, a.quality)).encode()
+            + (b'' if a.covariance is None else a.covariance.tobytes()) for a in answers]
+
+    assert run() == run()
