@@ -15,19 +15,25 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 from dataclasses import replace
 import io
 import json
 from pathlib import Path
 
+from nccs_pose.cli import main
 from nccs_pose.errors import OptionError, SimulationError
 from nccs_pose.estimation.residual import side
-from nccs_pose.evaluation import benchmark, experiments
+from nccs_pose.evaluation import benchmark
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.experiment_summary import summarise_cell
-from nccs_pose.evaluation.experiments import cells_of, EXPERIMENTS, NAMES, run_experiment
+from nccs_pose.evaluation.experiments import (
+    cells_of,
+    EXPERIMENTS,
+    NAMES,
+    run_experiment,
+    steps_of,
+)
 from nccs_pose.evaluation.line_projection import project_lines
 from nccs_pose.evaluation.trials import Answer, Cell, make_data_set, run_trial
 from nccs_pose.geometry.reflection_curve import Branch
@@ -42,8 +48,8 @@ def cell(mirror: str = 'spherical', **changes) -> Cell:
     return replace(Cell(mirror, 1.0, 5, 20, 1.0, key=(7,)), **changes)
 
 
-def rows_of(path: Path) -> list[dict]:
-    return list(csv.DictReader(io.StringIO(path.read_text(encoding='utf-8'))))
+def rows_of(text: str) -> list[dict]:
+    return list(csv.DictReader(io.StringIO(text)))
 
 
 @pytest.mark.parametrize('on_floor', [False, True])
@@ -123,34 +129,31 @@ def test_a_trial_depends_on_its_numbers_only() -> None:
     assert run_trial(QUICK, cell(key=(8,)), 3) != first
 
 
-def test_workers_do_not_change_a_byte(tmp_path: Path) -> None:
-    for workers in (1, 2):
-        run_experiment(
-            'no-guess', 2, tmp_path / str(workers), workers=workers, options=QUICK)
-    for file in ('no-guess.csv', 'no-guess.md'):
-        one, two = ((tmp_path / w / file).read_bytes() for w in ('1', '2'))
-        assert one == two
-    rows = rows_of(tmp_path / '1' / 'no-guess.csv')
+@pytest.mark.parametrize('backend', ['loky', 'threading'])
+def test_workers_do_not_change_a_byte(backend: str) -> None:
+    one = run_experiment('no-guess', 2, options=QUICK)
+    two = run_experiment('no-guess', 2, workers=2, backend=backend, options=QUICK)
+    assert two.csv == one.csv
+    assert two.summary == one.summary
+    rows = rows_of(one.csv)
     assert len(rows) == 3 * 2 * 2 * 2  # mirrors, levels, trials, estimators
     assert all(float(row['translation_m']) < 0.5 for row in rows)
     # fewer trials are the first of more
-    run_experiment('no-guess', 1, tmp_path / 'fewer', options=QUICK)
-    fewer = rows_of(tmp_path / 'fewer' / 'no-guess.csv')
+    fewer = rows_of(run_experiment('no-guess', 1, options=QUICK).csv)
     assert fewer == [row for row in rows if row['trial'] == '0']
 
 
-def test_what_an_experiment_writes(tmp_path: Path) -> None:
+def test_what_an_experiment_gives() -> None:
     said: list[str] = []
     options = ExperimentOptions(quick=True, lines=4, points=8)
-    summary = run_experiment(
-        'line-count', 1, tmp_path / 'new' / 'folder', options=options, progress=said.append)
-    folder = tmp_path / 'new' / 'folder'
-    assert len(said) == 18
-    assert (folder / 'line-count.md').read_text(encoding='utf-8') == summary
-    assert (folder / 'line-count.png').read_bytes().startswith(b'\x89PNG')
+    outcome = run_experiment('line-count', 1, options=options, progress=said.append)
+    assert len(said) == steps_of('line-count', options) == 18
     for word in ('Hyperbolic', 'Parabolic', 'Spherical', '× bound', 'farthest', '4 × 8'):
-        assert word in summary
-    rows = rows_of(folder / 'line-count.csv')
+        assert word in outcome.summary
+    again = 'experiment line-count --trials 1 --lines 4 --points 8 --quick --output DIR'
+    assert again in outcome.summary
+    assert len(outcome.figure.axes) == 6  # rotation and translation, three mirrors
+    rows = rows_of(outcome.csv)
     assert {row['lines'] for row in rows} == {'4', '6', '8', '10', '15', '20'}
     assert {row['sigma_world_m'] for row in rows} == {'0.05'}
     for row in rows:
@@ -198,24 +201,26 @@ def test_projected_points_lie_on_the_drawn_curves(mirror: str) -> None:
         assert np.median(gaps) < np.quantile(reach, 0.9)
 
 
-def test_line_projection_writes_its_figure(tmp_path: Path) -> None:
-    summary = run_experiment('line-projection', 1, tmp_path)
-    assert 'spurious' in summary
-    assert (tmp_path / 'line-projection.png').read_bytes().startswith(b'\x89PNG')
-    assert rows_of(tmp_path / 'line-projection.csv')[0]['mirror'] == 'hyperbolic'
+def test_line_projection_draws_its_figure() -> None:
+    outcome = run_experiment('line-projection', 1)
+    assert 'spurious' in outcome.summary
+    assert len(outcome.figure.axes) == 9
+    assert rows_of(outcome.csv)[0]['mirror'] == 'hyperbolic'
 
 
-def test_impossible_requests_are_refused_by_name(tmp_path: Path) -> None:
+def test_impossible_requests_are_refused_by_name() -> None:
     with pytest.raises(OptionError, match='nearest'):
         ExperimentOptions(nearest=3.0, farthest=2.0)
     with pytest.raises(OptionError, match='focal'):
         ExperimentOptions(focal=-1.0)
     with pytest.raises(OptionError, match='nonsense'):
-        run_experiment('nonsense', 1, tmp_path)
+        run_experiment('nonsense', 1)
     with pytest.raises(OptionError, match='trials'):
-        run_experiment('pixel-noise', 0, tmp_path)
+        run_experiment('pixel-noise', 0)
     with pytest.raises(OptionError, match='workers'):
-        run_experiment('pixel-noise', 1, tmp_path, workers=0)
+        run_experiment('pixel-noise', 1, workers=0)
+    with pytest.raises(OptionError, match="backend 'nonsense'"):
+        run_experiment('pixel-noise', 1, backend='nonsense')
     with pytest.raises(SimulationError, match='farthest'):
         # no line of a centimetre has twenty points between 0.3 and 0.3001 m
         options = ExperimentOptions(farthest=0.3001, length=2.0)
@@ -225,25 +230,23 @@ def test_impossible_requests_are_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_the_experiment_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    parser = argparse.ArgumentParser()
-    experiments.add_arguments(parser)
-    args = parser.parse_args([
-        'no-guess', '--trials', '1', '--output', str(tmp_path), '--workers', '1', '--quick',
-        '--farthest', '2.5'])
-    assert experiments.run(args) == 0
-    printed = capsys.readouterr()
-    assert 'no-guess.csv' in printed.out
-    assert '6 of 6 cells' in printed.err
-    assert '2.5' in (tmp_path / 'no-guess.md').read_text(encoding='utf-8')
+    folder = tmp_path / 'new' / 'folder'
+    words = ['experiment', 'no-guess', '--trials', '1', '--workers', '1', '--quick']
+    assert main([*words, '--output', str(folder), '--farthest', '2.5']) == 0
+    assert 'no-guess.csv' in capsys.readouterr().out
+    assert '--farthest 2.5' in (folder / 'no-guess.md').read_text(encoding='utf-8')
+    assert (folder / 'no-guess.png').read_bytes().startswith(b'\x89PNG')
+    assert len(rows_of((folder / 'no-guess.csv').read_text(encoding='utf-8'))) == 12
     assert set(NAMES) == {
         'line-projection', 'pixel-noise', 'world-noise', 'line-count', 'no-guess'}
+    # a folder that cannot be: said before the work, not after it
+    assert main([*words, '--output', str(folder / 'no-guess.csv')]) == 2
+    assert 'cannot be written' in capsys.readouterr().err
 
 
 def test_the_benchmark_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    parser = argparse.ArgumentParser()
-    benchmark.add_arguments(parser)
     output = tmp_path / 'out' / 'benchmark.json'
-    assert benchmark.run(parser.parse_args(['--repetitions', '3', '--output', str(output)])) == 0
+    assert main(['benchmark', '--repetitions', '3', '--output', str(output)]) == 0
     printed = capsys.readouterr().out
     assert 'times faster' in printed
     results = json.loads(output.read_text(encoding='utf-8'))

@@ -21,12 +21,10 @@ are the thread's own processor time: what else the machine does meanwhile is not
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 import json
 import os
-from pathlib import Path
 import platform
 import time
 from typing import Any
@@ -108,10 +106,11 @@ class Benchmark:
 
 
 def run_benchmark(
-    repetitions: int, progress: Callable[[str], None] = lambda text: None,
+    repetitions: int, progress: Callable[[str], None] = lambda note: None,
 ) -> Benchmark:
     """Time everything, ``repetitions`` times.
 
+    :param progress: called after each repetition on each of CELLS, with its name.
     :raises OptionError: for fewer than 3 repetitions.
     """
     if repetitions < 3:
@@ -129,7 +128,7 @@ def run_benchmark(
                 measured.setdefault(name, []).append(_seconds(work))
             apart = max(apart, _least_squares_apart(rig, data))
             poselib_apart.append(_poselib_apart(rig, data))
-            progress(f'{scene}: {repetition + 1} of {repetitions}')
+            progress(scene)
         timings[scene] = {n: Timing(n, np.array(s)) for n, s in measured.items()}
     compared = [a for a in poselib_apart if a is not None]
     return Benchmark(timings, apart, max(compared) if compared else None)
@@ -276,20 +275,3 @@ def as_json(benchmark: Benchmark) -> str:
             for scene, timings in benchmark.timings.items()},
         'least_squares_apart': benchmark.least_squares_apart,
         'poselib_apart': benchmark.poselib_apart}, indent=1) + '\n'
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of ``nccs-pose benchmark``."""
-    parser.add_argument('--repetitions', type=int, default=50, help='scenes timed (default 50)')
-    parser.add_argument('--output', type=Path, help='JSON file for every single timing')
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run ``nccs-pose benchmark`` and print the tables."""
-    benchmark = run_benchmark(args.repetitions)
-    print(report(benchmark))
-    if args.output is not None:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.write_text(as_json(benchmark), encoding='utf-8')
-        print(f'Written to {args.output}')
-    return 0

@@ -171,6 +171,6 @@ def _unbroken(curve: Array, jump: float) -> list[Array]:
 
 
 def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout='constrained')
+    figure = Figure(figsize=(width, height), dpi=90, layout='constrained')
     FigureCanvasAgg(figure)
     return figure

@@ -59,15 +59,25 @@ def summarise_cell(
         float(np.mean([a.failed(options) for a in mine])))
 
 
+def command(name: str, trials: int, options: ExperimentOptions) -> str:
+    """The command that gives the same numbers again."""
+    words = [f'nccs-pose experiment {name} --trials {trials}']
+    for field in dataclasses.fields(options):
+        value, flag = getattr(options, field.name), '--' + field.name.replace('_', '-')
+        if value != field.default:
+            words.append(flag if isinstance(value, bool) else f'{flag} {value}')
+    return ' '.join([*words, '--output DIR'])
+
+
 def summary_text(
     name: str, title: str, trials: int, options: ExperimentOptions, results: Results,
 ) -> str:
     """The whole page: what was run, and one table for each mirror."""
     parts = [
         f'# {title}\n',
-        f'`nccs-pose experiment {name}`, {trials} trials a cell. Medians of the absolute rotation '
-        'error and of the norm of the translation error; "× bound" is √(median NEES / 2.366), 1 '
-        'for an estimator at the Cramér–Rao bound; failures are errors beyond '
+        f'`{command(name, trials, options)}`: {trials} trials a cell. Medians of the absolute '
+        'rotation error and of the norm of the translation error; "× bound" is √(median NEES / '
+        '2.366), 1 for an estimator at the Cramér–Rao bound; failures are errors beyond '
         f'{options.failure_angle:g}° or {options.failure_distance:g} m. "bound" is a draw from '
         'the bound itself, which shows the chance in the other numbers.\n']
     for mirror in dict.fromkeys(cell.mirror for cell, _ in results):

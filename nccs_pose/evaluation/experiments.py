@@ -13,24 +13,20 @@
 # limitations under the License.
 """The paper's synthetic experiments, and the questions that it leaves: cells, runs, tables.
 
-A run writes the CSV of every trial, a figure and a Markdown summary into one folder. Trials are
-spread over processes by joblib; a trial's random numbers come from its seed, cell and number, so
-the CSV is the same, byte by byte, whatever the number of workers.
+A run gives the CSV of every trial, a figure and a Markdown summary. Trials are spread over
+processes by joblib; a trial's random numbers come from its seed, cell and number, so the CSV is
+the same, byte by byte, whatever the number of workers.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 import csv
-import dataclasses
 from dataclasses import dataclass
 import io
-import os
-from pathlib import Path
-import sys
 
 from joblib import delayed, Parallel
+from matplotlib.figure import Figure
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.experiment_plots import box_figure, projection_figure
@@ -98,26 +94,37 @@ def cells_of(name: str, options: ExperimentOptions) -> tuple[Cell, ...]:
     return tuple(cells)
 
 
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a run gives.
+
+    :ivar csv: every trial, a line each.
+    :ivar summary: medians, ratios to the bound and failures, as Markdown.
+    :ivar figure: as in the paper.
+    """
+
+    csv: str
+    summary: str
+    figure: Figure
+
+
 def run_experiment(
     name: str,
     trials: int,
-    output: Path,
     *,
     workers: int = 1,
     backend: str = 'loky',
     options: ExperimentOptions | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-) -> str:
-    """Run one experiment and write its CSV, figure and summary.
+    progress: Callable[[str], None] = lambda note: None,
+) -> Outcome:
+    """Run one experiment.
 
     :param name: one of NAMES.
     :param trials: trials per cell; for line-projection, scenes per mirror.
-    :param output: folder for NAME.csv, NAME.png and NAME.md; made where it does not exist.
     :param workers: processes.
     :param backend: of joblib: loky on one machine, or one that a cluster registers (dask, ray).
-    :param progress: called with one line of text after each cell.
-    :returns: the summary.
-    :raises OptionError: for an unknown name or a number of trials or workers below 1.
+    :param progress: called after each of :func:`steps_of` steps, with what it was.
+    :raises OptionError: for an unknown name or backend, or a number of trials or workers below 1.
     """
     options = options or ExperimentOptions()
     if name not in NAMES:
@@ -125,37 +132,43 @@ def run_experiment(
     for key, value in (('trials', trials), ('workers', workers)):
         if value < 1:
             raise OptionError(f'{key} = {value}: must be at least 1')
-    output.mkdir(parents=True, exist_ok=True)
-    header: tuple[str, ...] = _HEADER
-    rows: list[tuple[object, ...]]
     if name == LINE_PROJECTION:
-        scenes = [project_lines(options, mirror, trials) for mirror in TABLE_ONE]
-        rows, figure = [row for s in scenes for row in s.rows], projection_figure(scenes)
-        summary = projection_summary(scenes, options)
-        header = scenes[0].header
-    else:
-        results = _run_cells(name, trials, workers, backend, options, progress)
-        rows = [
-            row for cell, answers in results for i, trial in enumerate(answers)
-            for row in _rows(name, options, cell, i, trial)]
-        figure = box_figure(EXPERIMENTS[name].title, EXPERIMENTS[name].axis, results)
-        summary = summary_text(name, EXPERIMENTS[name].title, trials, options, results)
-    (output / f'{name}.csv').write_text(_csv(header, rows), encoding='utf-8')
-    (output / f'{name}.md').write_text(summary, encoding='utf-8')
-    figure.savefig(output / f'{name}.png', dpi=110)
-    return summary
+        scenes = []
+        for mirror in TABLE_ONE:
+            scenes.append(project_lines(options, mirror, trials))
+            progress(mirror)
+        text = _csv(scenes[0].header, [row for s in scenes for row in s.rows])
+        return Outcome(
+            text, projection_summary(scenes, trials, options), projection_figure(scenes))
+    results = _run_cells(cells_of(name, options), trials, workers, backend, options, progress)
+    rows = [
+        row for cell, answers in results for i, trial in enumerate(answers)
+        for row in _rows(name, options, cell, i, trial)]
+    experiment = EXPERIMENTS[name]
+    return Outcome(
+        _csv(_HEADER, rows), summary_text(name, experiment.title, trials, options, results),
+        box_figure(experiment.title, experiment.axis, results))
+
+
+def steps_of(name: str, options: ExperimentOptions) -> int:
+    """How many times a run calls ``progress``."""
+    return len(TABLE_ONE) if name == LINE_PROJECTION else len(cells_of(name, options))
 
 
 def _run_cells(
-    name: str, trials: int, workers: int, backend: str, options: ExperimentOptions,
+    cells: tuple[Cell, ...], trials: int, workers: int, backend: str, options: ExperimentOptions,
     progress: Callable[[str], None],
 ) -> list[tuple[Cell, list[tuple[Answer, ...]]]]:
-    cells, results = cells_of(name, options), []
-    with Parallel(n_jobs=workers, backend=backend if workers > 1 else 'sequential') as pool:
-        for i, cell in enumerate(cells):
+    results = []
+    try:
+        parallel = Parallel(n_jobs=workers, backend=backend)
+    except ValueError as error:
+        raise OptionError(f'backend {backend!r}: {error}') from error
+    with parallel as pool:
+        for cell in cells:
             answers = pool(delayed(run_trial)(options, cell, trial) for trial in range(trials))
             results.append((cell, list(answers)))
-            progress(f'{name}: {i + 1} of {len(cells)} cells ({cell.mirror}, {cell.level:g})')
+            progress(f'{cell.mirror}, {cell.level:g}')
     return results
 
 
@@ -188,34 +201,3 @@ def _csv(header: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
     writer.writerow(header)
     writer.writerows(rows)
     return text.getvalue()
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of ``nccs-pose experiment``."""
-    parser.add_argument('name', choices=NAMES, help='which experiment')
-    parser.add_argument('--trials', type=int, default=100, help='trials per cell (paper: 1000)')
-    parser.add_argument('--output', type=Path, required=True, help='folder for what it writes')
-    parser.add_argument(
-        '--workers', type=int, default=os.cpu_count() or 1, help='processes (all cores)')
-    parser.add_argument(
-        '--backend', default='loky', help="joblib's backend; one of a cluster's works too")
-    for field in dataclasses.fields(ExperimentOptions):
-        flag = '--' + field.name.replace('_', '-')
-        unit = f' [{field.metadata["unit"]}]' if field.metadata['unit'] else ''
-        text = f'{field.metadata["doc"]}{unit} (default {field.default})'
-        if isinstance(field.default, bool):
-            parser.add_argument(flag, action='store_true', help=text)
-        else:
-            parser.add_argument(flag, type=type(field.default), default=field.default, help=text)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run ``nccs-pose experiment`` and print the summary."""
-    options = ExperimentOptions(**{
-        field.name: getattr(args, field.name) for field in dataclasses.fields(ExperimentOptions)})
-    summary = run_experiment(
-        args.name, args.trials, args.output, workers=args.workers, backend=args.backend,
-        options=options, progress=lambda text: print(text, file=sys.stderr, flush=True))
-    print(summary)
-    print(f'Written to {args.output}: {args.name}.csv, {args.name}.png, {args.name}.md')
-    return 0

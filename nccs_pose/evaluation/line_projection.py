@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
-from nccs_pose.evaluation.experiment_summary import options_table
+from nccs_pose.evaluation.experiment_summary import command, options_table
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.paper_polynomials import paper_polynomials
 from nccs_pose.geometry.pose import Array
@@ -132,7 +132,9 @@ def _rows(
         for p, q, e in zip(line.points, m, np.stack([gamma, x, apart], axis=1))]
 
 
-def projection_summary(scenes: list[ProjectedScenes], options: ExperimentOptions) -> str:
+def projection_summary(
+    scenes: list[ProjectedScenes], trials: int, options: ExperimentOptions,
+) -> str:
     """Do the independently projected points lie on the curve? A Markdown page."""
     rows = [['mirror', 'points', 'γ, relative: worst', 'x − c11/c10: median (mm)', 'worst (mm)',
              'ray to line: worst (nm)']]
@@ -148,6 +150,7 @@ def projection_summary(scenes: list[ProjectedScenes], options: ExperimentOptions
         shares.append([scene.mirror, *(f'{100 * scene.zeros[b] / total:.0f} %' for b in names)])
     return '\n'.join([
         '# Projection of lines (the figure with lines, curves and projected points)\n',
+        f'`{command("line-projection", trials, options)}`: {trials} scenes a mirror. '
         'Curves by γ and x; points projected independently by the polynomial of degree 8.\n',
         table(rows),
         "Where γ is zero on the visible mirror (slices of equal height): only the first is the "

@@ -1,0 +1,44 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""`nccs-pose benchmark`: what the estimators cost, measured in one run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from nccs_pose.cli.progress import Progress
+from nccs_pose.evaluation.benchmark import as_json, CELLS, report, run_benchmark
+from nccs_pose.files.text_files import check_writable, write_text
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the command line."""
+    parser.add_argument('--repetitions', type=int, default=50, help='scenes timed (default 50)')
+    parser.add_argument('--output', type=Path, help='JSON file for every single timing')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the tables, and write the numbers behind them."""
+    if arguments.output is not None:
+        check_writable(arguments.output)
+    with Progress(len(CELLS) * max(0, arguments.repetitions), 'scenes') as progress:
+        benchmark = run_benchmark(arguments.repetitions, progress.step)
+    print(report(benchmark))
+    if arguments.output is not None:
+        write_text(arguments.output, as_json(benchmark))
+        print(f'Written: {arguments.output}')
+    return 0
