@@ -283,13 +283,12 @@ def test_an_unknown_colour_is_refused_by_name() -> None:
 
 
 def _stations(contrast: np.ndarray, n: int = 60) -> tuple[np.ndarray, ...]:
-    """Heights, power, floor samples and their use, as if n stations had shown a contrast."""
+    """Heights, power, clutter and floor, as if n stations had shown a contrast."""
     rng = np.random.default_rng(6)
     shade = rng.standard_normal((n, 8, 1)) * np.array([3.0, 4.0, 5.0])
-    floor = shade + 0.5 * rng.standard_normal((n, 8, 3))
-    return (
-        contrast + rng.standard_normal((n, 3)), np.ones(n), floor.astype(np.float32),
-        np.ones((n, 8), np.float32), FLOOR)
+    beside = shade + 0.5 * rng.standard_normal((n, 8, 3))
+    clutter = np.einsum('nki,nkj->nij', beside, beside) / 8.0
+    return contrast + rng.standard_normal((n, 3)), np.ones(n), clutter, FLOOR
 
 
 def test_the_contrast_and_the_floors_variation_are_learned() -> None:
@@ -320,10 +319,10 @@ def test_no_lesson_makes_a_colour_useless(seed: int) -> None:
     scale = 10.0 ** rng.uniform(-3, 2)
     colour = _colour()
     for _ in range(3):
+        beside = scale * rng.standard_normal((30, 5, 3))
         colour = colour.learn(
             scale * rng.standard_normal((30, 3)), rng.random(30),
-            (scale * rng.standard_normal((30, 5, 3))).astype(np.float32),
-            (rng.random((30, 5)) > 0.3).astype(np.float32), 200.0 * rng.random(3))
+            np.einsum('nki,nkj->nij', beside, beside) / 5.0, 200.0 * rng.random(3))
         assert np.isfinite(colour.discriminant).all()
         assert colour.discriminant @ colour.contrast == pytest.approx(1.0)
 

@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+import math
 
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 import numpy as np
-from numpy.typing import NDArray
 
 # Signs of the contrast (tape minus floor) in B, G, R of each class that a map may name.
 CONTRASTS: dict[str, tuple[float, float, float]] = {
@@ -82,43 +82,33 @@ class LineColour:
         weights = np.linalg.solve(self.clutter, self.contrast).astype(float)
         return weights / float(weights @ self.contrast)
 
-    def learn(
-        self, height: Array, power: Array, values: NDArray[np.float32],
-        beside: NDArray[np.float32], floor: Array,
-    ) -> LineColour:
-        """Take over the contrast seen at N stations and the variation of the floor beside them.
+    def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:
+        """Take over the contrast seen at N stations and the variation that is no tape's.
 
         A pose that is wrong shows floor where it expects tape; what it would teach is refused.
 
         :param height: contrast per station (N, 3).
         :param power: its information per unit of noise (N,).
-        :param values: samples of the stations (N, K, 3).
-        :param beside: 1 where a sample lies beside the tape, else 0 (N, K).
-        :param floor: its colour (3,), grey levels.
+        :param clutter: covariance of what no profile explains (N, 3, 3), grey levels^2.
+        :param floor: the floor's colour (3,), grey levels.
         """
         along = height @ self.discriminant
         total = float(power.sum())
         mean = float(power @ along) / total
         # Those of mere noise that happen to be positive would pass for a faint tape.
-        if mean < _EVIDENT * float(np.linalg.norm(power * (along - mean))) / total:
+        scatter = power * (along - mean)
+        if mean < _EVIDENT * math.sqrt(float(scatter @ scatter)) / total:
             return self
         good = along > 0.3 * max(float(np.median(along)), 0.0)
         if good.sum() < 10:
             return self
         weight = power * good
         contrast = weight @ height / weight.sum()
-        if self._unlike(contrast, floor) or np.linalg.norm(contrast) < _LEAST_CONTRAST:
+        if self._unlike(contrast, floor) or float(contrast @ contrast) < _LEAST_CONTRAST**2:
             return self
-        # A third of the pixels is plenty for six numbers.
-        values, used = values[good, ::3], beside[good, ::3]
-        count = np.maximum(used.sum(axis=1, keepdims=True), 1.0)
-        sums = (used[:, None] @ values)[:, 0]
-        picked = (values * used[..., None]).reshape(-1, 3)
-        scatter = picked.T @ values.reshape(-1, 3) - (sums / count).T @ sums
         # One grey level of rounding keeps a noise-free image from a singular covariance.
-        degrees = max(float(used.sum()) - len(used), 1.0)
-        clutter = scatter.astype(float) / degrees + 0.1 * np.eye(3)
-        return replace(self, contrast=contrast, clutter=clutter)
+        return replace(
+            self, contrast=contrast, clutter=clutter[good].mean(axis=0) + 0.1 * np.eye(3))
 
     def _unlike(self, contrast: Array, floor: Array) -> bool:
         """Whether a contrast (3,) to a floor's colour (3,) is another class's.
@@ -137,28 +127,19 @@ class LineColour:
     def _coloured(self) -> bool:
         return abs(sum(CONTRASTS[self.name])) < 1e-9
 
-    def sharpen(
-        self, feature: NDArray[np.float32], height: Array, even: NDArray[np.float32],
-        power: Array, soften: NDArray[np.float32],
-    ) -> LineColour:
+    def sharpen(self, height: Array, left: Array, power: Array) -> LineColour:
         """Take over the blur seen at N stations.
 
         A profile that is softer than its template leaves a residual along dT/d(blur), in
         proportion to its contrast; all stations together tell how much.
 
-        :param feature: samples along the discriminant, less their mean (N, K).
         :param height: contrast per station (N,), negative where there is none.
-        :param even: the template less its mean (N, K).
-        :param power: its power (N,).
-        :param soften: dT/d(blur) (N, K).
+        :param left: product of the stations' profile with dT/d(blur), the template itself taken
+            out of it (N,).
+        :param power: of that with itself (N,).
         """
         height = np.maximum(height, 0.0)
-        mean = soften.mean(axis=1, keepdims=True)
-        shared = np.einsum('nk,nk->n', soften, even) / power
-        left = np.einsum('nk,nk->n', soften, feature) - shared * np.einsum(
-            'nk,nk->n', even, feature)
-        own = np.einsum('nk,nk->n', soften, soften - mean) - shared**2 * power
-        total = float((height**2 * own).sum())
+        total = float((height * height) @ power)
         if total < 1e-9:
             return self
         step = float(np.clip((height @ left) / total, -_BLUR_STEP, _BLUR_STEP))

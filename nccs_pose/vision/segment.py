@@ -35,6 +35,9 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     'magenta': ((140, 60, 40), (170, 255, 255)),
     'cyan': ((80, 60, 40), (100, 255, 255)),
 }
+# A pixel of a tape has this part of the highest contrast so near.
+_PART_OF_PEAK = 0.6
+_NEAR_PEAK = np.ones((5, 5), np.uint8)
 # Blobs with a shorter outline are noise, px.
 _SMALLEST = 8
 # More blobs than this are clutter; the longest are kept (a byte numbers them).
@@ -58,7 +61,8 @@ class Segmentation:
 
 
 def chromatic_mask(
-    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int,
+    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int, *,
+    narrow: bool = False,
 ) -> Mask:
     """Where the image has more of a colour than its surroundings.
 
@@ -69,6 +73,8 @@ def chromatic_mask(
     :param gate: threshold in standard deviations of the image's noise.
     :param least: smallest contrast that counts, as a fraction of the image's brightness.
     :param window: width of the surroundings, px.
+    :param narrow: keep only the ridge of what is spread out by blur, or by the coarse colour of a
+        JPEG; it may cut the ends off a thin tape.
     """
     feature = _contrast(image, colour)
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
@@ -77,8 +83,15 @@ def chromatic_mask(
     noise = 1.4826 * float(np.median(np.abs(sparse)))
     brightness = float(np.median(image[::8, ::8, 1]))
     threshold = max(2.0, gate * noise, least * brightness)
-    return cv2.threshold(
-        cv2.subtract(feature, around), threshold, 255.0, cv2.THRESH_BINARY)[1]
+    raised = cv2.subtract(feature, around)
+    mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
+    if not narrow:
+        return mask
+    # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
+    # whole.
+    height = cv2.subtract(feature, float(np.median(feature[::8, ::8])))
+    peak = cv2.convertScaleAbs(cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
+    return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
 
 
 def _contrast(image: NDArray[np.uint8], colour: str) -> Mask:
