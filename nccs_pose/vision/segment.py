@@ -36,7 +36,8 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     'cyan': ((80, 60, 40), (100, 255, 255)),
 }
 # A pixel of a tape has this part of the highest contrast so near.
-_PART_OF_PEAK = 0.6
+_PART_OF_PEAK = 0.45
+_RIDGE = 0.65
 _NEAR_PEAK = np.ones((5, 5), np.uint8)
 # Blobs with a shorter outline are noise, px.
 _SMALLEST = 8
@@ -85,12 +86,11 @@ def chromatic_mask(
     threshold = max(2.0, gate * noise, least * brightness)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
-    if not narrow:
-        return mask
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
     # whole.
     height = cv2.subtract(feature, float(np.median(feature[::8, ::8])))
-    peak = cv2.convertScaleAbs(cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
+    peak = cv2.convertScaleAbs(
+        cv2.dilate(height, _NEAR_PEAK), alpha=_RIDGE if narrow else _PART_OF_PEAK)
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
 
 
