@@ -249,6 +249,7 @@ def test_the_benchmark_command(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert main(['benchmark', '--repetitions', '3', '--output', str(output)]) == 0
     printed = capsys.readouterr().out
     assert 'times faster' in printed
+    assert 'whole frame' in printed, "a frame's stages, as ratios to one threshold pass"
     results = json.loads(output.read_text(encoding='utf-8'))
     assert list(results['seconds']) == list(benchmark.CELLS)
     for timings in results['seconds'].values():

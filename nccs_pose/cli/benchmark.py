@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""`nccs-pose benchmark`: what the estimators cost, measured in one run."""
+"""`nccs-pose benchmark`: what the estimators and a frame's stages cost, measured in one run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ from pathlib import Path
 
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.benchmark import as_json, CELLS, report, run_benchmark
+from nccs_pose.evaluation.stages import LEAST_FRAMES, measure_stages, stages_table
 from nccs_pose.files.text_files import check_writable, write_text
+
+_WIDTH = 1280  # px, of the images whose stages are timed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +41,10 @@ def run(arguments: argparse.Namespace) -> int:
     with Progress(len(CELLS) * max(0, arguments.repetitions), 'scenes') as progress:
         benchmark = run_benchmark(arguments.repetitions, progress.step)
     print(report(benchmark))
+    frames = max(arguments.repetitions, LEAST_FRAMES)
+    with Progress(3 * frames - 2, 'frames') as progress:
+        costs = measure_stages(_WIDTH, frames, progress=progress.step)
+    print(stages_table(costs))
     if arguments.output is not None:
         write_text(arguments.output, as_json(benchmark))
         print(f'Written: {arguments.output}')

@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 TRACKING = 'tracking'
 SEARCHING = 'searching'
 STAGES = tuple(field.name for field in fields(StageTimes))
+LEAST_FRAMES = 4
 _RATE = 10.0
 _GREEN = ((40, 50, 40), (90, 255, 255))
 
@@ -85,10 +86,10 @@ def measure_stages(
 
     :param width: of the images, px; 4:3.
     :param frames: of the drive; the first is the start-up and is not counted as tracking.
-    :raises OptionError: for fewer than 4 frames.
+    :raises OptionError: for fewer than LEAST_FRAMES frames.
     """
-    if frames < 4:
-        raise OptionError(f'frames = {frames}: quartiles need at least 4')
+    if frames < LEAST_FRAMES:
+        raise OptionError(f'frames = {frames}: quartiles need at least {LEAST_FRAMES}')
     scene, track = arena_scene(width), figure_of_eight()
     rng = np.random.default_rng(seed)
     poses = [track.pose(k / _RATE) for k in range(frames)]
