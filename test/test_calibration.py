@@ -422,6 +422,10 @@ def test_frames_from_one_place_are_refused_with_where_to_drive():
     alike = [noisy(rig, Pose2(0.9, 0.6, 0.4), rng, k, sigma=0.5) for k in range(6)]
     with pytest.raises(CalibrationError, match=r'too few or too similar.*drive next.*x = '):
         calibrate(disturbed(rig, rng), LINES, alike, CalibrationOptions(pose_error=1e-3))
+    # What all of them share, no number of them shows.
+    sharp = [noisy(rig, Pose2(0.9, 0.6, 0.4), rng, k, sigma=0.002) for k in range(8)]
+    with pytest.raises(CalibrationError, match=r'from 1 place over .* too similar.*drive next.*x = '):
+        calibrate(disturbed(rig, rng), LINES, sharp)
 
 
 def test_a_wrong_map_and_a_wrong_mirror_are_not_fitted():

@@ -30,10 +30,12 @@ from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.problem import Problem
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 import numpy as np
 from numpy.typing import NDArray
 
+# Frames nearer than this (m, m, rad) are from one place: they share their errors.
+PLACE = np.array([0.05, 0.05, 0.1])
 _GRID = 5  # places each way
 _HEADINGS = 6
 _PREDICTED_POINTS = 16  # of each line, at a place that the robot has not visited
@@ -78,6 +80,22 @@ def choose(frames: FrameInformation, spread: Array, most: int) -> NDArray[np.int
         chosen.append(best)
         total = total + scaled[best]
     return np.array(chosen, dtype=np.intp)
+
+
+def same_place(a: Array, b: Array) -> bool:
+    """Whether two poses (3,) are of one place."""
+    off = a - b
+    off[2] = wrap_angle(off[2])
+    return bool((np.abs(off) < PLACE).all())
+
+
+def count_places(poses: Array) -> int:
+    """From how many places poses (F, 3) are."""
+    found: list[Array] = []
+    for pose in poses:
+        if not any(same_place(pose, other) for other in found):
+            found.append(pose)
+    return len(found)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from nccs_pose.calibration.adjustment import ArrowSystem
+from nccs_pose.calibration.frames import same_place
 from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
@@ -49,7 +50,7 @@ from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.options import check_options, option
 import numpy as np
@@ -57,7 +58,6 @@ from scipy.stats import f as fisher
 
 _CAUCHY = 2.385
 _LEAST_LINES = 2
-_PLACE = np.array([0.05, 0.05, 0.1])  # m, m, rad: frames nearer than this share their errors
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,6 @@ class _Place:
     gain: Array
     frames: int = 1
 
-    def holds(self, pose: Array) -> bool:
-        """Whether a pose (3,) is of this place."""
-        off = pose - self.pose
-        off[2] = wrap_angle(off[2])
-        return bool((np.abs(off) < _PLACE).all())
-
     def average(self, information: Array, slope: Array, gain: Array) -> None:
         """Take one more frame into the mean."""
         self.frames += 1
@@ -194,7 +188,7 @@ class CalibrationMonitor:
         weight = terms.hit / (1.0 + (terms.residual / (_CAUCHY * scale)) ** 2)
         system = ArrowSystem.of(terms, weight, problem.slices)
         information, slope, gain = system.reduced()
-        if self._places and self._places[-1].holds(here):
+        if self._places and same_place(here, self._places[-1].pose):
             self._places[-1].average(information, slope, gain[0])
         else:
             self._places.append(_Place(here, information, slope, gain[0]))

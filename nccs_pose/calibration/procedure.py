@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 from nccs_pose.calibration.adjustment import adjust, Adjustment, ArrowSystem
 from nccs_pose.calibration.first_poses import first_poses
-from nccs_pose.calibration.frames import advice, choose, frame_information, Terrain
+from nccs_pose.calibration.frames import advice, choose, count_places, frame_information, Terrain
 from nccs_pose.calibration.gauge import (
     pose_uncertainty,
     PoseUncertainty,
@@ -220,13 +220,18 @@ def _demand_knowledge(
     terrain = Terrain(
         parameters, result.theta, result.model, float(np.median(observations.sigma)))
     error, _ = terrain.position_error(result.information)
-    if error <= options.pose_error:
+    places = count_places(result.poses)
+    if error <= options.pose_error and places >= options.min_frames:
         return
     span = np.ptp(result.poses[:, :2], axis=0)
+    lacking = (
+        f'at least {options.min_frames} places are needed' if places < options.min_frames else
+        f'elsewhere on the map the pose could be off by {1e3 * error:.0f} mm (allowed: '
+        f'{1e3 * options.pose_error:.0f} mm)')
     raise CalibrationError(
-        f'{observations.frames} frames over {span[0]:.1f} m x {span[1]:.1f} m are too few or too '
-        f'similar: elsewhere on the map the pose could be off by {1e3 * error:.0f} mm (allowed: '
-        f'{1e3 * options.pose_error:.0f} mm); {advice(terrain.suggestions(result.information))}')
+        f'{observations.frames} frames from {places} {"place" if places == 1 else "places"} over '
+        f'{span[0]:.1f} m x {span[1]:.1f} m are too few or too similar: {lacking}; '
+        f'{advice(terrain.suggestions(result.information))}')
 
 
 def _verdict(
