@@ -424,7 +424,7 @@ def test_frames_from_one_place_are_refused_with_where_to_drive():
         calibrate(disturbed(rig, rng), LINES, alike, CalibrationOptions(pose_error=1e-3))
     # What all of them share, no number of them shows.
     sharp = [noisy(rig, Pose2(0.9, 0.6, 0.4), rng, k, sigma=0.002) for k in range(8)]
-    with pytest.raises(CalibrationError, match=r'from 1 place over .* too similar.*drive next.*x = '):
+    with pytest.raises(CalibrationError, match=r'from 1 place over .* too similar.*next.*x = '):
         calibrate(disturbed(rig, rng), LINES, sharp)
 
 
