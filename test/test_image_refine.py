@@ -44,7 +44,7 @@ def distances(rig: Rig, data: DataSet, pose: Pose2) -> np.ndarray:
     for k, (d, mu) in enumerate(zip(data.directions, data.moments)):
         foot = np.cross(d, mu) + d * (d @ (pose.translation - np.cross(d, mu)))
         line = Line(foot - 20.0 * d, foot + 20.0 * d)
-        curve = trace_line(rig, line.transformed(pose.inverse()), spacing=0.5)
+        curve = trace_line(rig, line.transformed(pose.inverse()), spacing=1.0)
         pixels = data.pixels[data.label == k]
         apart = np.linalg.norm(pixels[:, None] - curve[None], axis=2)
         found[data.label == k] = apart.min(axis=1)
@@ -60,7 +60,7 @@ def nees(data: DataSet, pose: Pose2, bound: np.ndarray) -> float:
 @pytest.mark.parametrize('mirror', ['parabolic', 'hyperbolic'])
 def test_coarse_pixels_come_nearer_to_their_curves_and_the_pose_to_the_bound(mirror: str) -> None:
     better, sampson, image = 0, [], []
-    for trial in range(40):
+    for trial in range(30):
         rig, data, d, mu = scene(mirror, trial, sigma_px=10.0)
         rays = rig.back_project(data.pixels)
         one = refine(rays, d, mu, data.truth, sigma=10.0).pose
@@ -68,10 +68,10 @@ def test_coarse_pixels_come_nearer_to_their_curves_and_the_pose_to_the_bound(mir
         bound = cramer_rao_bound(rig.back_project(data.clean), d, mu, data.truth, sigma=10.0)
         sampson.append(nees(data, one, bound))
         image.append(nees(data, two, bound))
-        if trial < 8:  # the likelihood itself, up to a constant
+        if trial < 5:  # the likelihood itself, up to a constant
             costs = [np.square(distances(rig, data, pose)).sum() for pose in (one, two)]
             better += costs[1] < costs[0]
-    assert better >= 7
+    assert better >= 4
     assert np.mean(np.minimum(image, 25.0)) < 0.93 * np.mean(np.minimum(sampson, 25.0))
 
 
