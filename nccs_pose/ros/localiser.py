@@ -22,19 +22,24 @@ from __future__ import annotations
 
 import signal
 import sys
+from typing import NoReturn
 
 
 def main() -> int:
     """Run the node until it is told to stop."""
-    # ROS passes the signal on to this handler, so that it means the same before and after.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        from nccs_pose.ros.localiser_node import make_node
-        from nccs_pose.ros.spinning import run
+    # ROS passes the signals on to these handlers, so that they mean the same before and after.
+    # No KeyboardInterrupt: where Python meets one in an exec it ends with SIGINT, caught or not.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _stop)
+    from nccs_pose.ros.localiser_node import make_node
+    from nccs_pose.ros.spinning import run
 
-        return run(make_node)
-    except KeyboardInterrupt:
-        return 0
+    return run(make_node)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    raise SystemExit(0)
 
 
 if __name__ == '__main__':

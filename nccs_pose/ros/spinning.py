@@ -104,12 +104,15 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     except StartError as error:
         print(error, file=sys.stderr)
         return 2
+    except Exception:
+        if rclpy.ok():  # else: shut down while the node was made
+            raise
     finally:
         try:
             if node is not None:
                 getattr(node, 'close', lambda: None)()
                 node.destroy_node()
-        except KeyboardInterrupt:  # a second Ctrl-C while cleaning up
+        except (KeyboardInterrupt, SystemExit):  # a second Ctrl-C while cleaning up
             pass
         rclpy.try_shutdown()
     return 0

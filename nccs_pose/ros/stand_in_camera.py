@@ -108,20 +108,22 @@ class StandInCamera(Node):
         # The first picture takes longest: what it prepares is kept.
         trajectory = figure_of_eight(speed=o.speed)
         frames = max(1, round(o.duration * o.rate))
-        args = (trajectory, frames, o.rate, WheelModel())
         render_frame(self._scene, make_drive(trajectory, 1, o.rate), 0, o.seed)
         drive = make_drive(
-            *args, rng=np.random.default_rng(o.seed), start_ns=self.get_clock().now().nanoseconds)
+            trajectory, frames, o.rate, WheelModel(), rng=np.random.default_rng(o.seed))
+        # The drive begins when it is ready, not when it was asked for.
+        start_ns = self.get_clock().now().nanoseconds - int(drive.stamps_ns[0])
         samples = [(s.stamp_ns, 0, k) for k, s in enumerate(drive.odometry)]
         samples += [(stamp_ns, 1, k) for k, stamp_ns in enumerate(drive.stamps_ns)]
         for stamp_ns, is_image, k in sorted(samples):
-            late = self._wait_until(stamp_ns)
+            late = self._wait_until(start_ns + stamp_ns)
             if not rclpy.ok():
                 return
             if not is_image:
-                self._publish_odometry(drive.odometry[k])
+                self._publish_odometry(start_ns + stamp_ns, drive.odometry[k])
             elif late < 1.0 / o.rate:
-                self._publish_image(render_frame(self._scene, drive, k, o.seed))
+                self._publish_image(
+                    start_ns + stamp_ns, render_frame(self._scene, drive, k, o.seed))
             else:
                 self.skipped += 1
                 self.get_logger().warning(
@@ -140,21 +142,21 @@ class StandInCamera(Node):
             time.sleep(max(0.0, min(left, 0.002) - (time.monotonic() - started)))
         return 0.0
 
-    def _publish_odometry(self, sample: OdometrySample) -> None:
+    def _publish_odometry(self, stamp_ns: int, sample: OdometrySample) -> None:
         prefix = self._options.frame_prefix
         self._odometry.publish(odometry_message(
-            sample.stamp_ns, prefix + 'odom', prefix + 'base_link', sample.pose,
+            stamp_ns, prefix + 'odom', prefix + 'base_link', sample.pose,
             sample.twist.forward, sample.twist.turn))
 
-    def _publish_image(self, sample: ImageSample) -> None:
+    def _publish_image(self, stamp_ns: int, sample: ImageSample) -> None:
         frame = self._options.frame_prefix + 'camera_optical'
         if self._options.image_transport == 'compressed':
             jpeg = cv2.imencode('.jpg', sample.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-            self._image.publish(compressed_message(sample.stamp_ns, frame, jpeg.tobytes()))
+            self._image.publish(compressed_message(stamp_ns, frame, jpeg.tobytes()))
         else:
-            self._image.publish(image_message(sample.stamp_ns, frame, sample.image))
-        self._info.publish(camera_info_message(sample.stamp_ns, frame, self._scene.rig.camera))
-        self._truth.publish(truth_message(sample.stamp_ns, 'map', sample.pose))
+            self._image.publish(image_message(stamp_ns, frame, sample.image))
+        self._info.publish(camera_info_message(stamp_ns, frame, self._scene.rig.camera))
+        self._truth.publish(truth_message(stamp_ns, 'map', sample.pose))
 
 
 def main() -> int:

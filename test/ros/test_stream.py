@@ -52,7 +52,8 @@ def test_stand_in_camera_is_localised_live(world, transport):
     user = world.user
     node = world.localiser(image_transport=transport, **ARENA)
     camera = world.start(
-        'stand_in_camera', '--ros-args', '-p', f'image_transport:={transport}', '-p', 'rate:=4.0')
+        'stand_in_camera', '--ros-args', '-p', f'image_transport:={transport}', '-p', 'rate:=4.0',
+        '-p', 'duration:=120.0')
     poses = user.listen(PoseWithCovarianceStamped, 'pose')
     truths = user.listen(PoseStamped, 'ground_truth/pose')
     infos = user.listen(CameraInfo, 'camera_info')
@@ -63,7 +64,8 @@ def test_stand_in_camera_is_localised_live(world, transport):
         stamps = {stamp_to_ns(t.header.stamp) for t in truths}
         return [p for p in poses if stamp_to_ns(p.header.stamp) in stamps]
 
-    assert user.wait(lambda: len(compared()) >= 6 and debug and markers), (
+    # A loaded machine renders a frame a second.
+    assert user.wait(lambda: len(compared()) >= 4 and debug and markers, 90.0), (
         node.output + camera.output)
     truth = {stamp_to_ns(t.header.stamp): planar(t.pose) for t in truths}
     for pose in compared():
