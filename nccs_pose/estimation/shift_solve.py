@@ -79,7 +79,7 @@ def solve_shifts(
         unknowns = np.linalg.solve(normal, weighted.T @ right + told)
         e = right - jacobian @ unknowns
         step = unknowns - before
-        if step @ normal @ step < 1e-3:
+        if step @ normal @ step < 1e-2:
             break
     inlier = np.abs(e) <= _GATE * _robust_scale(e)
     trusted = jacobian[inlier]

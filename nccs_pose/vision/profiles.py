@@ -41,13 +41,16 @@ from scipy.special import ndtr
 # Beyond the edges a band shows this much floor: so many px, and so many times the blur.
 _MARGIN_PX = 2.6
 _MARGIN_BLURS = 2.0
-# Grid points along the curve, per px; dense enough that hardly a pixel is missed.
-_DENSITY = 1.6
+# Grid points along the curve, per px: enough to miss hardly a pixel of a sharp image. A soft one
+# has been interpolated (lens, colour filter, JPEG), and its pixels repeat each other.
+_DENSITY = 2.0
+_DENSITY_BLUR = 0.62
+_LEAST_DENSITY = 0.6
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
-_ROUGH_DENSITY = 0.8
+_ROUGH_DENSITY = 0.5
 _ROUGH_BLUR = 0.6
 # At most so many pixels of a station are looked for along and across.
-_MOST_ALONG, _MOST_ACROSS = 32, 31
+_MOST_ALONG, _MOST_ACROSS = 40, 31
 # Samples along the curve that one station of a search averages, as fractions of its spacing.
 _ALONG_SEARCH = ((np.arange(4) + 0.5) / 4.0 - 0.5).astype(np.float32)
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
@@ -174,7 +177,9 @@ def fit_profiles(
     """
     blur = max(colour.blur, _ROUGH_BLUR) if rough else colour.blur
     margin = _MARGIN_PX + _MARGIN_BLURS * blur
-    pixels, s = _read_pixels(image, bands, margin, _ROUGH_DENSITY if rough else _DENSITY)
+    density = _ROUGH_DENSITY if rough else max(
+        min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
+    pixels, s = _read_pixels(image, bands, margin, density)
     count = s.shape[1]
     products, floor = _products(pixels, s, bands.half_width, blur)
     system = _eliminated(products)
