@@ -26,6 +26,7 @@ import types
 from typing import Any
 import xml.etree.ElementTree as ElementTree
 
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros import reference
 from nccs_pose.ros.interface import INPUTS, OUTPUTS
@@ -120,6 +121,9 @@ def test_parameter_file_names_parameters_that_exist(name: str, repository: Path)
     ((node, below),) = content.items()
     assert node == '/**/localiser'
     parameters = below['ros__parameters']
+    estimator = {key: parameters.pop(key) for key in list(parameters)
+                 if key in LocaliserOptions.__dataclass_fields__}
+    LocaliserOptions(**estimator)
     options = NodeOptions(**parameters)  # refuses unknown names, types and ranges
     if name != 'robot':
         rig, line_map = load_rig(resolve(options.rig_file)), load_map(resolve(options.map_file))

@@ -152,13 +152,19 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     assert user.wait(lambda: said(f'set {reliability}')), node.output
 
 
-def test_pause_is_said(world):
-    world.localiser(**ROOM)
+def test_paused_it_uses_no_image_and_says_so(world, arena):
+    world.localiser(**ARENA)
     user = world.user
+    images = user.publisher(Image, 'image')
+    messages = [image_message(s.stamp_ns, 'camera', s.image) for s in arena]
     assert user.call(SetBool, '/localiser/set_paused', SetBool.Request(data=True)).success
     assert user.wait(lambda: user.value('localiser: pose', 'reason') == 'paused')
+    user.show(images, *messages[:2])
+    assert user.count('frames_answered') == 0
     assert user.call(SetBool, '/localiser/set_paused', SetBool.Request(data=False)).success
     assert user.wait(lambda: user.value('localiser: pose', 'reason') != 'paused')
+    user.show(images, *messages[2:5])
+    assert user.count('frames_answered') > 0
 
 
 @pytest.mark.parametrize('arguments', [
