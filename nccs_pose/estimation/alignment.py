@@ -29,13 +29,14 @@ from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
-from nccs_pose.vision.profiles import fit_profiles, ProfileFit, search_profiles
+from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR, search_profiles
 import numpy as np
 from numpy.typing import NDArray
 
 # Stations stand this far apart in the image and average all of it, px.
 _SPACING = 16.0
-# A first, rough pass takes one station of so many; a search, so many of each line.
+# Where the image is sharp, so that a tape is felt from nearby only, a first, rough pass takes one
+# station of so many; a search, so many of each line.
 _ROUGH = 2
 _SEARCHED = 25
 # A profile is linear in its shift for about so many pixels.
@@ -144,7 +145,8 @@ class Aligner:
         places = self._predictor.places(pose, _SPACING, self._options.stations)
         if len(places) < _LEAST_STATIONS:
             return None
-        if len(places) >= _ROUGH * _LEAST_STATIONS:
+        sharp = min(colour.blur for colour in colours) < ROUGH_BLUR
+        if sharp and len(places) >= _ROUGH * _LEAST_STATIONS:
             rough = self._measure(image, places.every(_ROUGH), pose, prior, colours, rough=True)
             pose = pose if rough is None else rough.refinement.pose
         result: Alignment | None = None
@@ -206,18 +208,18 @@ class Aligner:
         if found.sum() < _LEAST_STATIONS:
             return None
         return self._solved(
-            shift[found], np.ones(int(found.sum())), slide[found], bands[found], start,
+            shift[found], np.ones(int(found.sum())), slide[found], bands.across[found], start,
             prior).pose
 
     def _solved(
-        self, shift: Array, sigma: Array, slide: Array, bands: Bands, start: Pose2,
+        self, shift: Array, sigma: Array, slide: Array, across: Array, start: Pose2,
         prior: tuple[Pose2, Array] | None,
     ) -> Refinement:
         options = self._options
         return solve_shifts(
             shift, sigma, slide, start, prior=prior,
             attitude_sigma=(options.height_sigma, options.tilt_sigma),
-            image_shift=bands.across, calibration_sigma=options.calibration_sigma)
+            image_shift=across, calibration_sigma=options.calibration_sigma)
 
     def _measure(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
@@ -232,7 +234,7 @@ class Aligner:
         if used.sum() < _LEAST_STATIONS:
             return None
         refinement = self._solved(
-            fit.shift[used], fit.sigma[used], slide[used], bands[used], start, prior)
+            fit.shift[used], fit.sigma[used], slide[used], bands.across[used], start, prior)
         step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
                          float(wrap_angle(refinement.pose.yaw - start.yaw))])
         moved = float(np.abs(slide[:, :3] @ step).max())

@@ -48,7 +48,7 @@ _DENSITY_BLUR = 0.62
 _LEAST_DENSITY = 0.6
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
 _ROUGH_DENSITY = 0.5
-_ROUGH_BLUR = 0.6
+ROUGH_BLUR = 0.6
 # At most so many pixels of a station are looked for along and across.
 _MOST_ALONG, _MOST_ACROSS = 40, 31
 # Samples along the curve that one station of a search averages, as fractions of its spacing.
@@ -175,7 +175,7 @@ def fit_profiles(
     :param colour: what the tapes' contrast and blur are expected to be.
     :param rough: look at some of the pixels only, and learn nothing.
     """
-    blur = max(colour.blur, _ROUGH_BLUR) if rough else colour.blur
+    blur = max(colour.blur, ROUGH_BLUR) if rough else colour.blur
     margin = _MARGIN_PX + _MARGIN_BLURS * blur
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
