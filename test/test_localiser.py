@@ -34,6 +34,8 @@ import pytest
 
 PERIOD_NS = 100_000_000
 SCENE = ideal_scene(640, noise=0.02)
+STILL = Pose2(0.0, 0.0, 0.0)
+DEFAULTS = LocaliserOptions()
 
 
 def _line(start: tuple[float, float], end: tuple[float, float], name: str = '') -> Line:
@@ -52,7 +54,7 @@ class Drive:
     """A robot that takes pictures and counts its wheels, in front of a localiser."""
 
     def __init__(
-        self, scene: Scene, pose: Pose2, options: LocaliserOptions = LocaliserOptions(),
+        self, scene: Scene, pose: Pose2, options: LocaliserOptions = DEFAULTS,
         wheels: bool = True, believed: LineMap | None = None,
     ) -> None:
         self.scene, self.pose, self.wheels = scene, pose, wheels
@@ -71,7 +73,7 @@ class Drive:
         return render(self.scene, self.pose, np.random.default_rng(self.pictures))
 
     def go(
-        self, step: Pose2 = Pose2(0.0, 0.0, 0.0), slip: Pose2 = Pose2(0.0, 0.0, 0.0),
+        self, step: Pose2 = STILL, slip: Pose2 = STILL,
         change: Callable[[np.ndarray], np.ndarray] = lambda image: image,
     ) -> Estimate:
         """Drive a step, of which the wheels do not notice the slip, and ask the localiser."""

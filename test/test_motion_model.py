@@ -28,7 +28,9 @@ SECOND = 10**9
 START = Pose2(3.0, -2.0, 2.9)
 
 
-def _track(stamp_ns: int, pose: Pose2, covariance: np.ndarray, seen_ns: int | None = None) -> Track:
+def _track(
+    stamp_ns: int, pose: Pose2, covariance: np.ndarray, seen_ns: int | None = None,
+) -> Track:
     return Track(stamp_ns, pose, covariance, None, stamp_ns if seen_ns is None else seen_ns)
 
 

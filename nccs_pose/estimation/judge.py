@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.misplaced import place_beside
+from nccs_pose.estimation.misplaced import placement
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor
@@ -33,7 +33,7 @@ from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
 
-# A line of which the pose rests on less than this part is looked for beside its place.
+# A line of which an expected pose rests on less than this part is looked for beside its place.
 _WEAK = 0.5
 # Its stations stand so close then, px.
 _CLOSE = 4.0
@@ -43,6 +43,8 @@ _BEYOND_DOUBT = 4
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
 # what is seen, one on three lines that of either; more lines speak for themselves.
 _MOST = 0.85
+# Residuals of this root mean square count half, px.
+_HALF_AS_GOOD = 1.0
 # A direction of the pose is open when its deviation exceeds this, metres and radians.
 OPEN = 0.5
 
@@ -83,22 +85,27 @@ class Judge:
         :param expected: whether a prediction agrees with the pose.
         """
         found = objection(alignment, self._map, self._options, expected=expected)
+        # Out of nothing every line in view is looked at, else those that leave a question.
+        least = _WEAK if expected else np.inf
         with np.errstate(invalid='ignore'):
-            weak = np.flatnonzero(alignment.support < _WEAK)
-        if found is not None or len(weak) == 0:
+            asked = np.flatnonzero(alignment.support < least)
+        asked = np.union1d(asked, [k for k in sorted(doubts) if alignment.support[k] >= 0.0])
+        if found is not None or len(asked) == 0:
             return found
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
         places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
         bands, _ = self._predictor.bands(places, alignment.pose)
-        for k in weak.tolist():
+        for k in asked.astype(int).tolist():
             line = self._map[k]
-            offset = place_beside(
+            seen = placement(
                 image, k, bands[bands.label == k], colours[line.colour], self._options.band,
                 alignment, self._map, self._table)
             name = line.name or f'number {k}'
-            if offset is not None:
-                return Objection(f'line {name} is seen {offset:.1f} px beside its place', line=k)
-            if k in doubts and lines_used(alignment) < _BEYOND_DOUBT:
+            if seen.beside is not None:
+                return Objection(
+                    f'line {name} is seen {seen.beside:.1f} px beside its place', line=k)
+            others = lines_used(alignment) - (alignment.support[k] >= _WEAK)
+            if k in doubts and not seen.confirmed and others < _BEYOND_DOUBT:
                 return Objection(
                     f'line {name} was seen beside its place, and not in it since', line=k)
         return None
@@ -112,21 +119,38 @@ class Judge:
                    or contradiction(alignment, segments, self._map))
         if against is not None:
             return against
-        score, claimed = self._searcher.score(alignment.pose, segments)
+        found = self.measured(alignment, segments)
         if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
             return Objection('the lines that it rests on do not fix a pose')
         used = lines_used(alignment)
-        weaker, stronger = sorted((claimed, alignment.explained))
+        weaker, stronger = sorted((found.claimed, alignment.explained))
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
             return Objection(
                 f'it rests on {used} lines and leaves too much unexplained', hidden=True)
-        return Found(alignment, claimed, np.sqrt(score * alignment.explained))
+        return found
+
+    def measured(self, alignment: Alignment, segments: tuple[FloorSegment, ...]) -> Found:
+        """How much a pose explains, whether it holds or not."""
+        score, claimed = self._searcher.score(alignment.pose, segments)
+        return Found(
+            alignment, claimed, float(np.sqrt(score * alignment.explained)) * _fit(alignment))
+
+
+def _fit(alignment: Alignment) -> float:
+    """How well the lines lie on the image, 1 for perfectly.
+
+    Where a room looks almost the same from two places this decides, not what is explained.
+    """
+    sigma = alignment.points.sigma
+    return 1.0 / (1.0 + float(np.mean(sigma**2)) / _HALF_AS_GOOD**2)
 
 
 def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:
-    """The doubts that are left after a pose that holds."""
-    if lines_used(alignment) >= _BEYOND_DOUBT:
+    """The doubts that are left after a pose that holds: of lines that it does not show.
+
+    Another place, another doubt: a line out of view (NaN) is no longer doubted.
+    """
+    if lines_used(alignment) > _BEYOND_DOUBT:
         return frozenset()
-    # A line out of view (NaN) is no longer doubted: another place, another doubt.
     return frozenset(k for k in doubts if alignment.support[k] < _WEAK)

@@ -50,6 +50,7 @@ from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
 
+_DEFAULTS = LocaliserOptions()
 # Poses of a search that are laid on the image itself.
 _TRIED = 6
 # A search's poses lie within this of the truth in the image, px.
@@ -60,8 +61,10 @@ _WORTH_TRYING = 0.6
 _BETTER = 0.15
 # A pose on fewer than three lines has to be where it is expected, within so many deviations.
 _FEW_GATE = 3.0
-# Odometry carries a pose on only while it explains this part of what looks like a line.
+# Odometry carries a pose on only while it explains this part of what looks like a line, if that is
+# more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
+_FOREIGN = 0.25
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
 
@@ -78,6 +81,14 @@ class _Sifted:
     held: list[Found]
     hidden: list[Candidate]
     objections: list[Objection]
+
+
+@dataclass(frozen=True, eq=False)
+class _Refused:
+    """The pose that was expected, laid on the image, and what the image says against it."""
+
+    objection: Objection | None = None
+    alignment: Alignment | None = None
 
 
 class _Stopwatch:
@@ -97,7 +108,7 @@ class Localiser:
     """Estimates T_map_base of one robot from its images, one at a time."""
 
     def __init__(
-        self, rig: Rig, line_map: LineMap, options: LocaliserOptions = LocaliserOptions(),
+        self, rig: Rig, line_map: LineMap, options: LocaliserOptions = _DEFAULTS,
     ) -> None:
         """Prepare the tables of a rig.
 
@@ -167,14 +178,14 @@ class Localiser:
         watch = _Stopwatch()
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
-        against: Objection | None = None
+        refused = _Refused()
         if prediction is not None:
             followed = self._follow(image, prediction, watch)
             if isinstance(followed, Found):
                 return self._tracking(
                     stamp_ns, followed, prediction, watch, 'the pose explains the image')
-            against = followed
-        return self._search(stamp_ns, image, prediction, against, watch)
+            refused = followed
+        return self._search(stamp_ns, image, prediction, refused, watch)
 
     def _predict(self, stamp_ns: int) -> Prediction | None:
         track, before = self._track, self._before
@@ -187,10 +198,10 @@ class Localiser:
 
     def _follow(
         self, image: NDArray[np.uint8], prediction: Prediction, watch: _Stopwatch,
-    ) -> Found | Objection | None:
-        """Lay the predicted pose on the image; no pose where the whole must be searched."""
+    ) -> Found | _Refused:
+        """Lay the predicted pose on the image; refused where the whole must be searched."""
         prior = (prediction.pose, prediction.covariance)
-        against: Objection | None = None
+        refused = _Refused()
         for reach in (0.0, self.options.band):
             alignment = self._aligner.align(
                 image, prediction.pose, self._colours, reach=reach, prior=prior)
@@ -200,8 +211,9 @@ class Localiser:
             against = self._judge.objection(image, alignment, self._doubts, expected=True)
             if against is None:
                 break
+            refused = _Refused(against, alignment)
         else:
-            return against
+            return refused
         self._frames_since_check += 1
         due = self._frames_since_check >= self.options.check_every
         if not (due or alignment.missing or len(alignment.lines) == 1):
@@ -211,13 +223,13 @@ class Localiser:
         watch.lap('detect')
         against = contradiction(alignment, segments, self._map)
         if against is not None:
-            return against
+            return _Refused(against, alignment)
         here, claimed = self._searcher.score(alignment.pose, segments)
         elsewhere = self._searcher.candidates(segments)
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):
-            return Objection('another pose explains the image better')
+            return _Refused(Objection('another pose explains the image better'), alignment)
         return Found(alignment, claimed, alignment.explained)
 
     def _expected(self, pose: Pose2, alignment: Alignment, prediction: Prediction | None) -> bool:
@@ -231,7 +243,7 @@ class Localiser:
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
-        against: Objection | None, watch: _Stopwatch,
+        refused: _Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         segments = self._searcher.segments(image)
@@ -242,12 +254,17 @@ class Localiser:
         hypotheses = carried(self._open, self._open_odometry, now)
         sifted = self._sift(image, candidates, hypotheses, segments, prediction, watch)
         held = sifted.held
+        if refused.alignment is not None:
+            # No jump to where less is explained than at the pose that was refused.
+            here = self._judge.measured(refused.alignment, segments).score
+            held = [f for f in held if f.score > here or same_pose(
+                f.alignment.pose, refused.alignment.pose)]
         if not held:
             trusted = self._trusted(image, segments, watch)
             if trusted is not None:
                 return self._tracking(
                     stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
-            against = against or (sifted.objections[0] if sifted.objections else None)
+            against = refused.objection or next(iter(sifted.objections), None)
             if against is not None and against.line is not None:
                 self._doubts |= {against.line}
             words = against.words if against is not None else _what_is_missing(segments)
@@ -414,7 +431,8 @@ class Localiser:
         if self._open:
             return True
         _, claimed = self._searcher.score(prediction.pose, segments)
-        return bool(segments) and claimed < _CLAIMED
+        foreign = (1.0 - claimed) * sum(strip.weight for strip in segments)
+        return claimed < _CLAIMED and foreign > _FOREIGN * self._table.rig.camera.width
 
 
 def _what_is_missing(segments: tuple[FloorSegment, ...]) -> str:

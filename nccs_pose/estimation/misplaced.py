@@ -12,13 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A line that the pose does not rest on, seen beside the place where it should be.
+"""Whether a line is seen beside the place where a pose says that it should be.
 
 An occluded line is nowhere. One that lies a few pixels beside its place says that the map, the
 rig or the pose is wrong, and the pixels cannot tell which.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.geometry.floor_table import FloorTable
@@ -35,49 +37,64 @@ _LEAST_STATIONS = 10
 _LEAST_SHARE = 0.5
 # They agree within this, px.
 _AGREE = 1.0
-# Beside its place a line is when it is off by this, px, and by so many standard deviations.
-_BESIDE = 0.8
+# Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
+# more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
+_BESIDE = 0.5
 _EVIDENT = 5.0
+_DISTURBED = 0.28
+# It is in its place when it is off by less than this for certain, px.
+_IN_PLACE = 0.5
 # What shows less or more contrast than this, as fractions of the tapes', is no tape.
 _CONTRAST = (0.35, 2.0)
 # What lies this near another line, metres beyond its footprint, is that line.
 _ON_ANOTHER = 0.05
 
 
-def place_beside(
+@dataclass(frozen=True)
+class Placement:
+    """Where a line is seen.
+
+    :ivar beside: how far beside its predicted place, px; None where it is not seen there.
+    :ivar confirmed: whether it is certainly seen in its place.
+    """
+
+    beside: float | None = None
+    confirmed: bool = False
+
+
+def placement(
     image: NDArray[np.uint8], line: int, bands: Bands, colour: LineColour, reach: float,
     alignment: Alignment, line_map: LineMap, table: FloorTable,
-) -> float | None:
-    """How far beside its predicted place a line is seen, px; None where it is not.
+) -> Placement:
+    """Where a line is seen.
 
     :param line: its index in the map.
     :param bands: its stations, as the pose predicts them.
-    :param reach: how far beside it is looked for, px.
+    :param reach: how far beside its place it is looked for, px.
     """
     if len(bands) < _LEAST_STATIONS:
-        return None
-    shift, agree = _close_by(image, bands, colour)
-    if not agree.any():
+        return Placement()
+    fit, _ = fit_profiles(image, bands, colour)
+    if fit.found.sum() >= max(_LEAST_STATIONS, _LEAST_SHARE * len(bands)):
+        mean, deviation = _mean_shift(fit.shift[fit.found], fit.sigma[fit.found])
+        off = abs(mean)
+        width = 2.0 * float(np.median(bands.half_width))
+        if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation):
+            return Placement(confirmed=off + 2.0 * deviation < _IN_PLACE)
+        shift, agree = np.full(len(bands), mean), fit.found
+    else:
         shift, agree = _farther(image, bands, colour, reach)
     if not agree.any() or _on_another(line, bands, shift, agree, alignment, line_map, table):
-        return None
-    return float(np.mean(np.abs(shift[agree])))
+        return Placement()
+    return Placement(beside=float(np.mean(np.abs(shift[agree]))))
 
 
-def _close_by(
-    image: NDArray[np.uint8], bands: Bands, colour: LineColour,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Shifts (N,) of less than a profile's width, and which stations say that it is not zero."""
-    fit, _ = fit_profiles(image, bands, colour)
-    agree = fit.found
-    if agree.sum() < max(_LEAST_STATIONS, _LEAST_SHARE * len(bands)):
-        return fit.shift, np.zeros(len(bands), dtype=bool)
-    weight = 1.0 / fit.sigma[agree] ** 2
-    mean = float(weight @ fit.shift[agree] / weight.sum())
-    spread = float(weight @ (fit.shift[agree] - mean) ** 2 / agree.sum())
-    deviation = np.sqrt(max(1.0, spread) / weight.sum())
-    beside = abs(mean) > max(_BESIDE, _EVIDENT * deviation)
-    return np.full(len(bands), mean), agree & beside
+def _mean_shift(shift: Array, sigma: Array) -> tuple[float, float]:
+    """Mean of shifts (N,) and its standard deviation, no less than they scatter."""
+    weight = 1.0 / sigma**2
+    mean = float(weight @ shift / weight.sum())
+    spread = float(weight @ (shift - mean) ** 2) / len(shift)
+    return mean, float(np.sqrt(max(1.0, spread) / weight.sum()))
 
 
 def _farther(
@@ -102,7 +119,7 @@ def _farther(
             np.abs(fit.shift - fit.shift[i] - slope * (along - along[i])) <= _AGREE)
         if follows.sum() > best.sum():
             best = follows
-    if best.sum() < least or np.mean(np.abs(fit.shift[best])) < _BESIDE:
+    if best.sum() < least or np.mean(np.abs(fit.shift[best])) < _AGREE:
         best = np.zeros(len(bands), dtype=bool)
     return fit.shift, best
 

@@ -32,11 +32,12 @@ _NEAR = 0.6
 _PARALLEL = 0.12
 # A strip closer than this to a map line lies on it, metres beyond its own footprint.
 _ON = 0.06
-# A whole line lies off its place when its mean is this many standard deviations from zero.
-_EVIDENT = 4.0
-# Few lines leave little redundancy. Residuals so many times the noise of the image, and larger
-# than this (px), say then that they are not those lines, or not seen by this rig: by two, by three.
-_UNLIKE_NOISE = {2: (5.0, 0.0), 3: (3.0, 0.3)}
+# A whole line lies off its place when its mean is this many standard deviations from zero: what
+# surrounds a tape of a third of a pixel shifts it by more than its scatter tells.
+_EVIDENT = 7.0
+# Residuals so many times the noise of the image, and larger than this (px), say that two lines are
+# others, or not seen by this rig; that three are; and that more are, where none was expected.
+_UNLIKE_NOISE = ((5.0, 0.0), (3.0, 0.3), (3.0, 0.4))
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,7 @@ class Objection:
 
 def lines_used(alignment: Alignment) -> int:
     """How many lines a pose rests on."""
-    # A line out of view has no support: NaN is not as large as anything.
-    return int(np.count_nonzero(alignment.support >= _RESTS))
+    return int((np.nan_to_num(alignment.support) >= _RESTS).sum())
 
 
 def objection(
@@ -84,12 +84,11 @@ def objection(
     used = lines_used(alignment)
     residual, told = _residuals(alignment)
     scale, size = (float(np.sqrt(np.mean(np.square(e)))) for e in (residual, residual * told))
-    if used <= 3:
-        times, least = _UNLIKE_NOISE[max(used, 2)]
-        if scale > times and size > least:
-            return Objection(
-                f'it rests on {used} lines, and they lie {size:.1f} px off where the noise of the '
-                f'image makes {size / scale:.2f} px')
+    times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
+    if scale > times and size > least and (used < 4 or not expected):
+        return Objection(
+            f'the {used} lines that it rests on lie {size:.1f} px off, where the noise of the '
+            f'image makes {size / scale:.2f} px')
     if used < 3 and alignment.missing and not expected:
         return Objection(
             f'it rests on {used} lines and {len(alignment.missing)} more should be in view',
