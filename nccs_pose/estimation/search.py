@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 
 # Enough for a blob over all lines of a field at once.
 _PIXELS_PER_BLOB = 400
+# With fewer strips than this the image is looked at again, for tapes spread out by blur.
+_ENOUGH = 3
 
 
 class Searcher:
@@ -45,27 +47,38 @@ class Searcher:
         self._columns = slice(int(columns[0]), int(columns[-1]) + 1)
         self._region = np.ascontiguousarray(table.region[self._rows, self._columns])
 
-    def segmentation(self, image: NDArray[np.uint8], colour: str) -> Segmentation:
-        """Blobs of one colour where the image shows the floor."""
+    def segmentation(
+        self, image: NDArray[np.uint8], colour: str, *, narrow: bool = False,
+    ) -> Segmentation:
+        """Blobs of one colour where the image shows the floor, or only their ridges."""
         part = image[self._rows, self._columns]
         options = self._options
         if options.threshold == 'hsv':
             mask = hsv_mask(part, colour)
         else:
             mask = chromatic_mask(
-                part, colour, options.noise_gate, options.least_contrast, options.window)
+                part, colour, options.noise_gate, options.least_contrast, options.window,
+                narrow=narrow)
         found = find_blobs(cv2.bitwise_and(mask, self._region), _PIXELS_PER_BLOB)
         origin = np.array([self._columns.start, self._rows.start], dtype=float)
         return Segmentation(found.mask, found.pixels + origin, found.label, found.weight)
 
     def segments(self, image: NDArray[np.uint8]) -> tuple[FloorSegment, ...]:
         """Straight strips of the map's colours on the floor."""
+        found = self._strips(image, narrow=False)
+        if len(found) < _ENOUGH and self._options.threshold == 'chromaticity':
+            ridges = self._strips(image, narrow=True)
+            found = ridges if len(ridges) > len(found) else found
+        return tuple(sorted(found, key=lambda s: -s.weight))
+
+    def _strips(self, image: NDArray[np.uint8], *, narrow: bool) -> list[FloorSegment]:
         found: list[FloorSegment] = []
         for colour in self._colours:
             widths = [line.width for line in self._map if line.colour == colour]
             found.extend(floor_segments(
-                self.segmentation(image, colour), self._table, max(widths), colour))
-        return tuple(sorted(found, key=lambda s: -s.weight))
+                self.segmentation(image, colour, narrow=narrow), self._table, max(widths),
+                colour))
+        return found
 
     def candidates(self, segments: tuple[FloorSegment, ...]) -> tuple[Candidate, ...]:
         """Poses that explain the strips, best first."""
