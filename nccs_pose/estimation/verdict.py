@@ -56,7 +56,8 @@ class Objection:
 
 def lines_used(alignment: Alignment) -> int:
     """How many lines a pose rests on."""
-    return int((np.nan_to_num(alignment.support) >= _RESTS).sum())
+    # A line out of view has no support: NaN is not as large as anything.
+    return int(np.count_nonzero(alignment.support >= _RESTS))
 
 
 def objection(
