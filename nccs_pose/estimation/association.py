@@ -34,6 +34,11 @@ from numpy.typing import NDArray
 # Strips that start hypotheses, and hypotheses that are looked at closely.
 _SEEDS = 6
 _CLOSE = 200
+# A map of many equal places gives no end of hypotheses: those of the heaviest strips are enough,
+# and above this number every fourth sample tells which are worth a closer look.
+_ENOUGH = 1500
+_MANY = 400
+_COARSE = 4
 _REFINED = 24
 # Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
 _CROSSING = 0.12
@@ -86,8 +91,9 @@ def global_candidates(
     if len(poses) == 0:
         return ()
     scorer = _Scorer(segments, lines, table)
-    claimed = scorer.claimed(poses)
-    poses = poses[np.argsort(-claimed, kind='stable')[:_CLOSE]]
+    if len(poses) > _MANY:
+        poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_MANY]]
+    poses = poses[np.argsort(-scorer.claimed(poses), kind='stable')[:_CLOSE]]
     score = scorer.score(poses)
     order = np.argsort(-score, kind='stable')[:_REFINED]
     refined = scorer.refine(poses[order])
@@ -147,9 +153,11 @@ def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array
     between_lines = map_angle[a] - map_angle[b]
     same_colour = {
         s.colour: np.array([colour == s.colour for colour in lines.colour]) for s in segments}
-    poses = []
+    poses: list[Array] = []
     for i, first in enumerate(segments):
         for second in segments[i + 1:]:
+            if sum(map(len, poses)) > _ENOUGH:
+                break
             angles = [np.arctan2(-s.normal[0], s.normal[1]) for s in (first, second)]
             between = angles[0] - angles[1]
             if abs(np.sin(between)) < np.sin(_CROSSING):
@@ -213,11 +221,17 @@ class _Scorer:
             lines.start[:, None]
             + (share * lines.length[:, None])[..., None] * lines.direction[:, None])
 
-    def _on_lines(self, poses: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Whether each sample (H, P) lies on a map line, which one, and how far off it."""
+    def _on_lines(
+        self, poses: Array, step: int = 1,
+    ) -> tuple[NDArray[np.bool_], NDArray[np.intp], Array]:
+        """Whether each sample (H, P) lies on a map line, which one, and how far off it.
+
+        :param step: look at one sample out of so many.
+        """
+        points = self._points[step // 2::step]
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        x = c[:, None] * self._points[:, 0] - s[:, None] * self._points[:, 1] + poses[:, :1]
-        y = s[:, None] * self._points[:, 0] + c[:, None] * self._points[:, 1] + poses[:, 1:2]
+        x = c[:, None] * points[:, 0] - s[:, None] * points[:, 1] + poses[:, :1]
+        y = s[:, None] * points[:, 0] + c[:, None] * points[:, 1] + poses[:, 1:2]
         lines = self._lines
         best = np.full(x.shape, np.inf)
         which = np.zeros(x.shape, dtype=np.intp)
@@ -227,17 +241,18 @@ class _Scorer:
             along = (lines.direction[k, 0] * (x - lines.start[k, 0])
                      + lines.direction[k, 1] * (y - lines.start[k, 1]))
             outside = ((along < -_BEYOND) | (along > lines.length[k] + _BEYOND)
-                       | self._foreign[k])
+                       | self._foreign[k, step // 2::step])
             distance = np.where(outside, np.inf, np.abs(across))
             closer = distance < best
             best = np.where(closer, distance, best)
             which = np.where(closer, k, which)
-        return best < self._tolerance, which, best
+        return best < self._tolerance[step // 2::step], which, best
 
-    def claimed(self, poses: Array) -> Array:
-        """Fraction of the strips' pixels on map lines (H,)."""
-        on, _, _ = self._on_lines(poses)
-        return on @ self._weight / self._weight.sum()
+    def claimed(self, poses: Array, step: int = 1) -> Array:
+        """Fraction of the strips' pixels on map lines (H,), by one sample out of ``step``."""
+        on, _, _ = self._on_lines(poses, step)
+        weight = self._weight[step // 2::step]
+        return on @ weight / weight.sum()
 
     def explained(self, poses: Array) -> Array:
         """Fraction of the map lines in view that strips lie on (H,)."""
