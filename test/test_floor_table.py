@@ -60,6 +60,33 @@ def test_pixels_of_ground_points_are_those_of_the_exact_projection(
     assert error.max() < 2e-2
 
 
+def test_derivatives_of_pixels_are_those_of_the_exact_projection(
+        rig: Rig, table: FloorTable) -> None:
+    points = _floor_points(rig, 1.5, 400)
+    # Next to the mirror's foot there is no direction outward, and the robot stands there.
+    points = points[np.linalg.norm(points - rig.T_base_mirror.translation[:2], axis=1) > 0.2]
+    rng = np.random.default_rng(5)
+    direction = rng.normal(size=points.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+
+    def exact(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return rig.project(np.column_stack([at, np.zeros(len(at))]))
+
+    h = 3e-3
+    (ahead, a), (here, b), (behind, c) = (
+        exact(points + step * direction) for step in (h, 0.0, -h))
+    seen = a & b & c
+    assert seen.sum() > 100
+    found = table.expand(points)
+    polar = found.polar(direction)
+    np.testing.assert_allclose(found.pixels[seen], table.pixels(points)[seen], atol=1e-9)
+    slope, bend = (ahead - behind) / (2.0 * h), (ahead + behind - 2.0 * here) / h**2
+    assert np.abs(found.slope(polar) - slope)[seen].max() < 2e-3 * np.abs(slope[seen]).max()
+    # The curve's bend counts over some pixels along it only.
+    assert np.median(np.abs(found.curvature(polar) - bend)[seen]) < 0.01 * np.abs(
+        bend[seen]).max()
+
+
 def test_the_region_is_where_pixels_see_the_floor(rig: Rig, table: FloorTable) -> None:
     v, u = np.mgrid[0:rig.camera.height:7, 0:rig.camera.width:7]
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
