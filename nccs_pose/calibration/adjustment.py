@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 _CAUCHY = 2.385
 _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
 _BEYOND = 3.0  # standard deviations: scatter of the pulls that is no chance
+_SOUND = 5.0  # robust residual in units of the noise as told, beyond which nothing fits yet
 _FEET = 2  # how often the feet of the perpendiculars are dropped
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
 # A pose is somewhere within 100 m and 10 rad: keeps every block regular, moves nothing.
@@ -174,7 +175,9 @@ def adjust(
             f'only {int(inlier.sum())} of {len(observations)} points lie on the lines that they '
             'should be on: wrong map, wrong mirror, or a rough rig too far off')
     for _ in range(_FEET):
-        problem.drop_feet(theta, poses)
+        # Curves that are far from the pixels say nothing of where on them the feet would be.
+        if scale <= _SOUND:
+            problem.drop_feet(theta, poses)
         theta, poses, terms, finished, more = _descend(
             problem, theta, poses, inlier, False, max_iterations)
         used += more
