@@ -47,9 +47,12 @@ _MOST_BESIDE = 0.35
 _MISFIT = 0.15
 _THINNED = 4
 # Of one that is not, lines are drawn through so many of its pixels and their neighbours within
-# this distance (m, and footprints), and through as many pairs of its pixels.
+# this distance (m, and footprints), and through as many pairs of its pixels; all such blobs have
+# so many of these lines together, and so many pixels.
 _SEEDS = 24
 _NEIGHBOURS = (0.35, 4.0)
+_MOST_SEEDS = 96
+_MOST_PIXELS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +132,10 @@ def floor_segments(
     segments: list[FloorSegment] = []
     distance = np.abs(normals @ floor.T - offsets[:, None])
     near = distance < points.tolerance(normals, width)
+    worth = near.astype(np.float32)
     alive = np.ones(len(normals), dtype=bool)
     while len(segments) < most and alive.any():
-        support = np.where(alive, (near & free) @ points.weight, 0.0)
+        support = np.where(alive, worth @ (points.weight * free).astype(np.float32), 0.0)
         best = int(support.argmax())
         alive[best] = False
         if support[best] < _LEAST_PIXELS:
@@ -160,9 +164,8 @@ def _candidates(
     """
     normals: list[Array] = []
     offsets: list[float] = []
-    kept = []
+    kept, tangled = [], []
     bounds = np.flatnonzero(np.diff(points.blob, prepend=-1, append=-1))
-    rng = np.random.default_rng(0)
     for first, last in itertools.pairwise(bounds.tolist()):
         part = points[first:last]
         if last - first < 3:
@@ -173,21 +176,30 @@ def _candidates(
         misfit = np.abs(part.floor @ normal - offset) > part.tolerance(normal, width)
         if misfit.mean() <= _MISFIT or last - first < _LEAST_PIXELS:
             kept.append(np.arange(first, last, 1 if last - first < 60 else _THINNED))
-            continue
-        kept.append(np.arange(first, last))
-        for normal, offset in (*_through_neighbours(part, width), *_through_pairs(part, rng)):
+        else:
+            tangled.append((first, last))
+    rng = np.random.default_rng(0)
+    step = 1 + sum(last - first for first, last in tangled) // _MOST_PIXELS
+    seeds = max(1, min(_SEEDS, _MOST_SEEDS // max(1, len(tangled))))
+    for first, last in tangled:
+        kept.append(np.arange(first, last, step))
+        part = points[first:last:step]
+        for normal, offset in (
+                *_through_neighbours(part, width, seeds), *_through_pairs(part, rng, seeds)):
             normals.append(normal)
             offsets.append(offset)
-    index = np.concatenate(kept) if kept else np.zeros(0, dtype=np.intp)
+    index = np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.intp)
     return np.array(normals).reshape(-1, 2), np.array(offsets), index
 
 
-def _through_neighbours(part: _Points, width: float) -> list[tuple[Array, float]]:
+def _through_neighbours(
+    part: _Points, width: float, seeds: int,
+) -> list[tuple[Array, float]]:
     """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
     lines = []
     precision = _precision(part.jacobian, width)
     footprint = np.sqrt(0.5 * (part.spread[0] + part.spread[2]))
-    for k in range(0, len(part.floor), max(1, len(part.floor) // _SEEDS)):
+    for k in range(0, len(part.floor), max(1, len(part.floor) // seeds)):
         reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint[k]
         offset = part.floor - part.floor[k]
         near = np.einsum('pi,pi->p', offset, offset) < reach**2
@@ -196,9 +208,11 @@ def _through_neighbours(part: _Points, width: float) -> list[tuple[Array, float]
     return lines
 
 
-def _through_pairs(part: _Points, rng: np.random.Generator) -> list[tuple[Array, float]]:
+def _through_pairs(
+    part: _Points, rng: np.random.Generator, seeds: int,
+) -> list[tuple[Array, float]]:
     """Lines through random pairs of a blob's pixels."""
-    pair = part.floor[rng.integers(0, len(part.floor), (_SEEDS, 2))]
+    pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2))]
     along = pair[:, 1] - pair[:, 0]
     length = np.linalg.norm(along, axis=1)
     pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
