@@ -22,6 +22,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+import nccs_pose.cli.one_thread  # noqa: F401 - before numpy
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.experiments import NAMES, run_experiment, steps_of
