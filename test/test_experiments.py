@@ -258,12 +258,7 @@ def test_the_experiment_command(tmp_path: Path, capsys: pytest.CaptureFixture) -
     assert 'cannot be written' in capsys.readouterr().err
 
 
-def test_the_benchmark_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # the stages of a frame have tests of their own
-    monkeypatch.setattr('nccs_pose.cli.benchmark.measure_stages', lambda *_, **__: None)
-    monkeypatch.setattr('nccs_pose.cli.benchmark.stages_table', lambda _: '')
+def test_the_benchmark_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     output = tmp_path / 'out' / 'benchmark.json'
     assert main(['benchmark', '--repetitions', '3', '--output', str(output)]) == 0
     printed = capsys.readouterr().out
