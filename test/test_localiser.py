@@ -26,7 +26,7 @@ from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import ideal_scene, Scene
 import numpy as np
@@ -318,6 +318,36 @@ def test_a_line_beside_its_place_is_named_and_no_pose_is_given() -> None:
         assert estimate.pose is None
         assert 'line' in estimate.reason
         assert ' px ' in estimate.reason or ' m ' in estimate.reason
+
+
+# ---------------------------------------------------------------- a floor that is not flat
+
+
+def _tilted(scene: Scene, roll: float, pitch: float) -> Scene:
+    rig = scene.rig
+    tilt = RigidTransform.from_rpy(np.array([roll, pitch, 0.0]), np.zeros(3))
+    return replace(scene, rig=replace(rig, T_base_mirror=tilt @ rig.T_base_mirror))
+
+
+def test_roll_and_pitch_are_estimated_where_the_floor_is_not_flat() -> None:
+    rng = np.random.default_rng(3)
+    held: list[float] = []
+    free: list[float] = []
+    for _ in range(8):
+        direction = rng.uniform(-np.pi, np.pi)
+        tilt = math.radians(0.3) * np.array([math.cos(direction), math.sin(direction)])
+        pose = Pose2(*rng.uniform(-0.8, 0.8, 2), rng.uniform(-np.pi, np.pi))
+        image = render(_tilted(SCENE, *tilt), pose, rng)
+        for sigma, errors in ((0.0, held), (math.radians(0.3), free)):
+            # The flat answer is so far off that it might be withheld.
+            options = LocaliserOptions(tilt_sigma=sigma, largest_misfit=20.0)
+            estimate = Localiser(SCENE.rig, SCENE.line_map, options).process(10**9, image)
+            if estimate.pose is not None:
+                error = estimate.pose.as_array() - pose.as_array()
+                errors.append(float(np.hypot(error[0], error[1])))
+    assert len(free) >= 7
+    assert np.median(held) > 0.01
+    assert np.median(free) < 0.1 * np.median(held)
 
 
 # ---------------------------------------------------------------- the same again

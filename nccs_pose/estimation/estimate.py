@@ -28,18 +28,25 @@ import numpy as np
 
 
 class State(Enum):
-    """How much the localiser knows; the definitions are numeric and stand in its options."""
+    """How much the localiser knows. Words in *stars* are its options; their numbers are there."""
 
     SEARCHING = 'searching'
-    """No pose yet: nothing in the images so far fits the map."""
+    """No pose was ever held: nothing in the images so far fits the map. None is given."""
     AMBIGUOUS = 'ambiguous'
-    """Several poses explain the image about equally well; all are candidates, none is given."""
+    """Two poses or more explain the image, and the second scores more than *ambiguity_ratio* of
+    the best, in the mean of all images since they were first seen. All are candidates, none is
+    given."""
     TRACKING = 'tracking'
-    """The pose explains the image."""
+    """The pose explains the image: at least *least_explained* of the predicted line pixels are
+    found, no line and no stretch of lines lies off by more than *largest_misfit*, no line is seen
+    beside its place; and it lies within *innovation_gate* of the prediction (3 deviations where it
+    rests on fewer than three lines), or two images in a row agree on it.
+    """
     COASTING = 'coasting'
-    """The image says too little; the pose is the last one carried on by odometry."""
+    """The image says too little; the last pose is carried on by odometry, for *coast_time* at most
+    and up to *coast_sigma*, unless an image shows another place."""
     LOST = 'lost'
-    """There was a pose, and it no longer explains the image nor can be carried on."""
+    """There was a pose, and it neither explains the image nor can be carried on. None is given."""
 
 
 @dataclass(frozen=True)

@@ -94,11 +94,12 @@ class Judge:
             return found
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
         places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
-        bands, _ = self._predictor.bands(places, alignment.pose)
+        bands, slide = self._predictor.bands(places, alignment.pose)
+        moved = slide[:, 3:] @ alignment.refinement.attitude
         for k in asked.astype(int).tolist():
-            line = self._map[k]
+            line, own = self._map[k], bands.label == k
             seen = placement(
-                image, k, bands[bands.label == k], colours[line.colour], self._options.band,
+                image, k, bands[own], moved[own], colours[line.colour], self._options.band,
                 alignment, self._map, self._table)
             name = line.name or f'number {k}'
             if seen.beside is not None:

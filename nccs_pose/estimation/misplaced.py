@@ -63,28 +63,30 @@ class Placement:
 
 
 def placement(
-    image: NDArray[np.uint8], line: int, bands: Bands, colour: LineColour, reach: float,
-    alignment: Alignment, line_map: LineMap, table: FloorTable,
+    image: NDArray[np.uint8], line: int, bands: Bands, moved: Array, colour: LineColour,
+    reach: float, alignment: Alignment, line_map: LineMap, table: FloorTable,
 ) -> Placement:
     """Where a line is seen.
 
     :param line: its index in the map.
-    :param bands: its stations, as the pose predicts them.
+    :param bands: its stations, as the pose predicts them on a flat floor.
+    :param moved: where height, roll and pitch move them (N,), px across.
     :param reach: how far beside its place it is looked for, px.
     """
     if len(bands) < _LEAST_STATIONS:
         return Placement()
     fit, _ = fit_profiles(image, bands, colour)
     if fit.found.sum() >= max(_LEAST_STATIONS, _LEAST_SHARE * len(bands)):
-        mean, deviation = _mean_shift(fit.shift[fit.found], fit.sigma[fit.found])
+        mean, deviation = _mean_shift((fit.shift - moved)[fit.found], fit.sigma[fit.found])
         off = abs(mean)
         width = 2.0 * float(np.median(bands.half_width))
         if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation):
             return Placement(confirmed=off + 2.0 * deviation < _IN_PLACE)
         shift, agree = np.full(len(bands), mean), fit.found
     else:
-        shift, agree = _farther(image, bands, colour, reach)
-    if not agree.any() or _on_another(line, bands, shift, agree, alignment, line_map, table):
+        shift, agree = _farther(image, bands, moved, colour, reach)
+    if not agree.any() or _on_another(
+            line, bands, shift + moved, agree, alignment, line_map, table):
         return Placement()
     return Placement(beside=float(np.mean(np.abs(shift[agree]))))
 
@@ -98,30 +100,30 @@ def _mean_shift(shift: Array, sigma: Array) -> tuple[float, float]:
 
 
 def _farther(
-    image: NDArray[np.uint8], bands: Bands, colour: LineColour, reach: float,
+    image: NDArray[np.uint8], bands: Bands, moved: Array, colour: LineColour, reach: float,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Shifts (N,) found anywhere in the band, and the stations that agree on one."""
     fit = search_profiles(image, bands, colour, reach)
+    shift = fit.shift - moved
     fits = fit.found & (fit.contrast > _CONTRAST[0]) & (fit.contrast < _CONTRAST[1])
     along = np.linspace(-1.0, 1.0, len(bands))
     found = np.flatnonzero(fits)
     best = np.zeros(len(bands), dtype=bool)
     least = max(_LEAST_STATIONS, _LEAST_SHARE * len(bands))
     if len(found) < least:
-        return fit.shift, best
+        return shift, best
     # Straight beside its place, turned or not: the pair of stations that most others follow.
     first, last = np.triu_indices(len(found), 1)
     first, last = found[first], found[last]
     apart = np.flatnonzero(along[last] - along[first] > 0.5)[::7]
     for i, j in zip(first[apart], last[apart]):
-        slope = (fit.shift[j] - fit.shift[i]) / (along[j] - along[i])
-        follows = fits & (
-            np.abs(fit.shift - fit.shift[i] - slope * (along - along[i])) <= _AGREE)
+        slope = (shift[j] - shift[i]) / (along[j] - along[i])
+        follows = fits & (np.abs(shift - shift[i] - slope * (along - along[i])) <= _AGREE)
         if follows.sum() > best.sum():
             best = follows
-    if best.sum() < least or np.mean(np.abs(fit.shift[best])) < _AGREE:
+    if best.sum() < least or np.mean(np.abs(shift[best])) < _AGREE:
         best = np.zeros(len(bands), dtype=bool)
-    return fit.shift, best
+    return shift, best
 
 
 def _on_another(

@@ -141,6 +141,7 @@ class FloorTable:
             whole, rig.cop, rig.T_base_mirror.inverse().apply(points.reshape(-1, 3)))
         pixels, in_front = rig.camera.project((m - rig.cop) @ rig.R_mirror_camera)
         seen = (visible & in_front).reshape(points.shape[:2])
+        self._falls = self._outward_by_fall(points, m, seen)
         if not seen[_PADDING].any():
             raise GeometryError('the rig sees no floor: its nadir is not in the mirror')
         pixels = pixels.reshape(*points.shape[:2], 2)
@@ -155,6 +156,35 @@ class FloorTable:
             rows.append(4.0 * rows[-1] - 6.0 * rows[-2] + 4.0 * rows[-3] - rows[-4])
         padded = np.array(rows)
         return spline_filter(padded[..., 0]), spline_filter(padded[..., 1])
+
+    def _outward_by_fall(
+        self, points: Array, m: Array, seen: NDArray[np.bool_],
+    ) -> tuple[Array, Array]:
+        """Distance from the mirror's foot, and how far out a ray goes there for each metre down.
+
+        The ray comes from its own point of the mirror, not from the mirror's origin.
+
+        :param points: on the floor (angles, azimuths, 3), in base_link.
+        :param m: their mirror points, in the mirror frame (angles x azimuths, 3).
+        :param seen: which are seen (angles, azimuths).
+        """
+        mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
+        offset = points[..., :2] - self._centre
+        radius = np.linalg.norm(offset, axis=2)
+        outward = np.einsum('rai,rai->ra', points[..., :2] - mirror[..., :2], offset)
+        fall = np.maximum(mirror[..., 2], 1e-6) * np.maximum(radius, 1e-9)
+        rows = [row for row in range(_PADDING + 1, len(points)) if seen[row].any()]
+        return radius[rows, 0], np.array(
+            [float(np.mean((outward[row] / fall[row])[seen[row]])) for row in rows])
+
+    def falls(self, offset: Array) -> Array:
+        """How far a ray goes over the floor (N, 2) for each metre that it falls, in base_link.
+
+        :param offset: where it meets the floor, from the mirror's foot (N, 2), metres.
+        """
+        radius = np.sqrt(np.einsum('ni,ni->n', offset, offset))
+        outward = np.interp(radius, *self._falls)
+        return offset * (outward / np.maximum(radius, 1e-9))[:, None]
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
