@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+import math
 
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
@@ -60,10 +61,14 @@ _LEAST_STATIONS = 12
 _PLAIN_LENGTH = 60.0
 _PLAIN_WIDTH = 1.0
 _MISSING = 0.25
-# Neighbours that may share one cause of error: a block of JPEG or a tile, a shade, half a line. A
-# share counts that chance makes once in so many standard deviations.
-_BLOCKS = (4, 12)
+# So many neighbours may share one cause of error (a block of JPEG, a tile); chance alone makes
+# them look so once in so many standard deviations.
+_BLOCK = 4
 _CHANCE = 1.5
+# So may half a line (a shade along it, a row of tiles). There are few of those: this many that err
+# by chance alone are thought of beside them, and less than this is chance.
+_THOUGHT = 1.0
+_LEAST_COMMON = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,31 +287,35 @@ def _common_errors(
     :param residual: whitened residuals (N,), along each line in order.
     :param sigma: their scale (N,), px.
     :param label: line (N,), ascending.
-    :returns: the variance of sums over blocks of neighbours against that of independent ones (1
-        for white noise, up to the block's size where whole stretches err together), and the root
-        mean square of the blocks' means beyond noise, px.
+    :returns: the variance of sums over blocks of neighbours, or over halves of lines, against that
+        of independent ones (1 for white noise); and the root mean square of the blocks' means
+        beyond noise, px.
     """
-    factor, misfit = 1.0, 0.0
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(label)) + 1, [len(label)]])
+    edges = [0, *(np.flatnonzero(np.diff(label)) + 1).tolist(), len(label)]
     variance = max(float(np.mean(residual**2)), 1e-12)
-    for size in _BLOCKS:
-        first = np.concatenate([
-            np.arange(start, end - size + 1, size)
-            for start, end in pairwise(edges.tolist())])
-        if not len(first):
-            continue
-        block = first[:, None] + np.arange(size)
-        e = residual[block]
-        in_px = e * sigma[block]
+    factor, misfit = 1.0, 0.0
+    first = np.concatenate([
+        np.arange(start, end - _BLOCK + 1, _BLOCK) for start, end in pairwise(edges)])
+    # The fit has taken three degrees of freedom out of the blocks.
+    degrees = len(first) - 3
+    if len(first):
+        e = residual[first[:, None] + np.arange(_BLOCK)]
+        in_px = e * sigma[first[:, None] + np.arange(_BLOCK)]
         common = float(np.mean(np.square(in_px.mean(axis=1))))
-        noise = float(np.mean(np.square(in_px))) / size
-        misfit = max(misfit, float(np.sqrt(max(0.0, common - noise))))
-        # The fit has taken three degrees of freedom out of the blocks.
-        degrees = len(first) - 3
-        if degrees < 3:
-            continue
-        together = float(np.square(e.sum(axis=1)).sum()) / (size * degrees * variance)
-        if together > 1.0 + _CHANCE * np.sqrt(2.0 / degrees):
+        noise = float(np.mean(np.square(in_px))) / _BLOCK
+        misfit = math.sqrt(max(0.0, common - noise))
+        together = float(np.square(e.sum(axis=1)).sum()) / (_BLOCK * variance * max(degrees, 1))
+        if degrees >= 3 and together > 1.0 + _CHANCE * math.sqrt(2.0 / degrees):
+            factor = together
+    halves = [part for start, end in pairwise(edges)
+              for part in ((start, (start + end) // 2), ((start + end) // 2, end))]
+    size = np.array([end - start for start, end in halves])
+    degrees = len(halves) - 3
+    if degrees >= 1 and size.min() >= 2:
+        sums = np.add.reduceat(residual, [start for start, _ in halves])
+        shared = float((np.square(sums) / size).sum()) / variance
+        together = (_THOUGHT + shared) / (_THOUGHT + degrees)
+        if together > _LEAST_COMMON:
             factor = max(factor, together)
     return factor, misfit
 

@@ -43,7 +43,7 @@ _LEAST_CONTRAST = 3.0
 _EVIDENT = 4.0
 # Blur that an image can have, px, and how far one image may change it.
 _BLUR_RANGE = (0.25, 3.0)
-_BLUR_STEP = 0.3
+_BLUR_STEP = 0.5
 
 
 @dataclass(frozen=True, eq=False)

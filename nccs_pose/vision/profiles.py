@@ -45,7 +45,7 @@ _MARGIN_BLURS = 2.0
 # has been interpolated (lens, colour filter, JPEG), and its pixels repeat each other.
 _DENSITY = 2.0
 _DENSITY_BLUR = 0.62
-_LEAST_DENSITY = 0.6
+_LEAST_DENSITY = 0.45
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
 _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
