@@ -42,7 +42,7 @@ from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Pred
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
+from nccs_pose.estimation.verdict import contradiction, is_weak, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -59,8 +59,9 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.6
 # A pose elsewhere must beat the tracked one by this much to unseat it.
 _BETTER = 0.15
-# A pose on fewer than three lines has to be where it is expected, within so many deviations.
-_FEW_GATE = 3.0
+# A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
+# deviations.
+_WEAK_GATE = 3.0
 # Odometry carries a pose on only while it explains this part of what looks like a line, if that is
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
@@ -237,8 +238,8 @@ class Localiser:
         if prediction is None:
             return False
         gate = self.options.innovation_gate
-        if lines_used(alignment) < 3:
-            gate = min(gate, _FEW_GATE)
+        if is_weak(alignment):
+            gate = min(gate, _WEAK_GATE)
         return close(pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
 
     def _search(
@@ -419,7 +420,7 @@ class Localiser:
                 return Estimate(
                     stamp_ns, State.COASTING,
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
-                    prediction.covariance, times=watch.times)
+                    prediction.carried, times=watch.times)
         state = State.LOST if self._ever_tracked else State.SEARCHING
         return Estimate(
             stamp_ns, state, missing, times=watch.times,
