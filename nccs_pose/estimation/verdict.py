@@ -83,8 +83,7 @@ def objection(
             f'{_name(line_map, k)} lies {abs(mean[k]):.1f} px off: the rig or the map does not '
             'fit the image', line=k)
     used = lines_used(alignment)
-    residual, told = _residuals(alignment)
-    scale, size = (float(np.sqrt(np.mean(np.square(e)))) for e in (residual, residual * told))
+    scale, size = _misfits(alignment)
     times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
     if scale > times and size > least and (used < 4 or not expected):
         return Objection(
@@ -95,6 +94,20 @@ def objection(
             f'it rests on {used} lines and {len(alignment.missing)} more should be in view',
             hidden=True)
     return None
+
+
+def is_weak(alignment: Alignment) -> bool:
+    """Whether a pose rests on so little, or fits so badly, that it has to be where expected."""
+    scale, size = _misfits(alignment)
+    times, least = _UNLIKE_NOISE[1]
+    return lines_used(alignment) < 3 or (scale > times and size > least)
+
+
+def _misfits(alignment: Alignment) -> tuple[float, float]:
+    """Root mean square residual, as a multiple of the noise of the image and in px."""
+    residual, told = _residuals(alignment)
+    return (float(np.sqrt(np.mean(residual**2))),
+            float(np.sqrt(np.mean((residual * told) ** 2))))
 
 
 def _line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
