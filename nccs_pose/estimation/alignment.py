@@ -56,6 +56,8 @@ _MOVED_PX = 3.0
 # What still steps at the end, by less than this (m and rad), is uncertain by that much more.
 _LAST_STEP = 0.005
 _LEAST_STATIONS = 12
+# Of a searched pose this part of what must be found at the end has to be found from the first.
+_HOPELESS = 0.8
 # A line of so many pixels of curve, so wide in the image (px), of which less than this fraction
 # is found, is missing.
 _PLAIN_LENGTH = 60.0
@@ -161,6 +163,8 @@ class Aligner:
                 return None
             known, colours = colours, measured.colours
             result = _alignment(measured, self._lines)
+            if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
+                return None
             step = result.pose.as_array() - pose.as_array()
             step[2] = wrap_angle(step[2])
             sharpest = min(colour.blur for colour in colours)
