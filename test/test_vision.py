@@ -29,7 +29,8 @@ from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import CONTRASTS, LineColour
-from nccs_pose.vision.profiles import fit_profiles, search_profiles
+from nccs_pose.vision.profile_search import search_profiles
+from nccs_pose.vision.profiles import fit_profiles
 from nccs_pose.vision.segment import chromatic_mask, find_blobs, hsv_mask
 import numpy as np
 import pytest

@@ -17,9 +17,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
-import math
 
+from nccs_pose.estimation.common_errors import common_errors
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
@@ -30,7 +29,8 @@ from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
-from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR, search_profiles
+from nccs_pose.vision.profile_search import search_profiles
+from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,14 +63,6 @@ _HOPELESS = 0.8
 _PLAIN_LENGTH = 60.0
 _PLAIN_WIDTH = 1.0
 _MISSING = 0.25
-# So many neighbours may share one cause of error (a block of JPEG, a tile); chance alone makes
-# them look so once in so many standard deviations.
-_BLOCK = 4
-_CHANCE = 1.5
-# So may half a line (a shade along it, a row of tiles). There are few of those: this many that err
-# by chance alone are thought of beside them, and less than this is chance.
-_THOUGHT = 1.0
-_LEAST_COMMON = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +252,7 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     sigma, label = fit.sigma[index], bands.label[index]
     scale = float(np.sqrt(np.mean(residual**2)))
     pixels = bands.midline[index] + fit.shift[index, None] * bands.across[index]
-    correlation, misfit = _common_errors(residual, sigma, label)
+    correlation, misfit = common_errors(residual, sigma, label)
     return Alignment(
         refinement.pose, correlation * refinement.covariance, refinement,
         LinePoints(pixels, scale * sigma, label), float(worth[index].sum() / worth.sum()),
@@ -281,47 +273,6 @@ def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
     seen = np.bincount(bands.label, plain)
     there = np.bincount(bands.label[found], plain[found], minlength=len(seen))
     return tuple(np.flatnonzero((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).tolist())
-
-
-def _common_errors(
-    residual: Array, sigma: Array, label: NDArray[np.intp],
-) -> tuple[float, float]:
-    """What the residuals of neighbours have in common.
-
-    :param residual: whitened residuals (N,), along each line in order.
-    :param sigma: their scale (N,), px.
-    :param label: line (N,), ascending.
-    :returns: the variance of sums over blocks of neighbours, or over halves of lines, against that
-        of independent ones (1 for white noise); and the root mean square of the blocks' means
-        beyond noise, px.
-    """
-    edges = [0, *(np.flatnonzero(np.diff(label)) + 1).tolist(), len(label)]
-    variance = max(float(np.mean(residual**2)), 1e-12)
-    factor, misfit = 1.0, 0.0
-    first = np.concatenate([
-        np.arange(start, end - _BLOCK + 1, _BLOCK) for start, end in pairwise(edges)])
-    # The fit has taken three degrees of freedom out of the blocks.
-    degrees = len(first) - 3
-    if len(first):
-        e = residual[first[:, None] + np.arange(_BLOCK)]
-        in_px = e * sigma[first[:, None] + np.arange(_BLOCK)]
-        common = float(np.mean(np.square(in_px.mean(axis=1))))
-        noise = float(np.mean(np.square(in_px))) / _BLOCK
-        misfit = math.sqrt(max(0.0, common - noise))
-        together = float(np.square(e.sum(axis=1)).sum()) / (_BLOCK * variance * max(degrees, 1))
-        if degrees >= 3 and together > 1.0 + _CHANCE * math.sqrt(2.0 / degrees):
-            factor = together
-    halves = [part for start, end in pairwise(edges)
-              for part in ((start, (start + end) // 2), ((start + end) // 2, end))]
-    size = np.array([end - start for start, end in halves])
-    degrees = len(halves) - 3
-    if degrees >= 1 and size.min() >= 2:
-        sums = np.add.reduceat(residual, [start for start, _ in halves])
-        shared = float((np.square(sums) / size).sum()) / variance
-        together = (_THOUGHT + shared) / (_THOUGHT + degrees)
-        if together > _LEAST_COMMON:
-            factor = max(factor, together)
-    return factor, misfit
 
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:

@@ -28,7 +28,8 @@ from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.profiles import fit_profiles, search_profiles
+from nccs_pose.vision.profile_search import search_profiles
+from nccs_pose.vision.profiles import fit_profiles
 import numpy as np
 from numpy.typing import NDArray
 

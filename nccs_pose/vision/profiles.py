@@ -36,7 +36,6 @@ from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 # Beyond the edges a band shows this much floor: so many px, and so many times the blur.
 _MARGIN_PX = 2.6
@@ -51,8 +50,6 @@ _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
 # At most so many pixels of a station are looked for along and across.
 _MOST_ALONG, _MOST_ACROSS = 40, 31
-# Samples along the curve that one station of a search averages, as fractions of its spacing.
-_ALONG_SEARCH = ((np.arange(4) + 0.5) / 4.0 - 0.5).astype(np.float32)
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
 _CONTRAST_SPREAD = 0.2
 # Residuals this much above the usual are no chance any more.
@@ -60,9 +57,9 @@ _CHANCE = 2.5
 # The blur is learned from bands that lie this well on their tapes, px.
 _SHARP_PX = 0.3
 # A line whose contrast is this many standard deviations above nothing is there.
-_FOUND = 6.0
+FOUND = 6.0
 # A line this much fainter than its colour's contrast, or a station than its line, is not.
-_FOUND_FRACTION = 0.35
+FOUND_FRACTION = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +88,8 @@ def _read_pixels(
     """
     # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
     # across for its real part and the one along (backwards) for its imaginary part.
-    centre = _as_complex(bands.centre)
-    across = _as_complex(bands.across)[:, None]
+    centre = as_complex(bands.centre)
+    across = as_complex(bands.across)[:, None]
     bend = (0.5 * bands.bend).astype(np.float32)[:, None]
     half_band = (bands.half_width + margin).astype(np.float32)
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
@@ -116,7 +113,8 @@ def _read_pixels(
     return values.reshape(n, m * k, 3), np.subtract(at.real, s, out=s)
 
 
-def _as_complex(points: Array) -> NDArray[np.complex64]:
+def as_complex(points: Array) -> NDArray[np.complex64]:
+    """Points (N, 2) of the image as complex numbers u + iv (N,)."""
     return np.ascontiguousarray(points, dtype=np.float32).view(np.complex64)[:, 0]
 
 
@@ -265,7 +263,7 @@ def _shifts(
     a = system.height @ weights - system.by_shift * moved
     told = power / variance
     level, certain = _levels(label, a, power, told)
-    found = certain & (a + 1.0 / np.sqrt(told) > _FOUND_FRACTION * level)
+    found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One station's contrast is noisy where the tape is thin; its neighbours know better.
     prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
     smooth = np.maximum((a * told + level * prior) / (told + prior), 1e-9)
@@ -290,55 +288,5 @@ def _levels(
     middle = np.searchsorted(total, 0.5 * (bounds[1:] + bounds[:-1]))
     level = a[order[np.minimum(middle, len(order) - 1)]]
     # Far stations are faint one by one, but a whole line of them is not.
-    certain = (level * np.sqrt(np.bincount(number, told)) > _FOUND) & (level > 0.1)
+    certain = (level * np.sqrt(np.bincount(number, told)) > FOUND) & (level > 0.1)
     return np.where(certain, level, 1e-9)[number], certain[number]
-
-
-def search_profiles(
-    image: NDArray[np.uint8], bands: Bands, colour: LineColour, reach: float,
-) -> ProfileFit:
-    """The best match of each station's profile anywhere within ``reach`` pixels across.
-
-    For a prediction that is several pixels off; good to about a pixel.
-    """
-    half = float(np.percentile(bands.half_width, 75)) if len(bands) else 1.0
-    kernel_half = int(np.ceil(half + 3.0))
-    side = int(np.ceil(reach)) + kernel_half
-    s = np.broadcast_to(
-        np.arange(-side, side + 1.0, dtype=np.float32), (len(bands), 2 * side + 1))
-    weights = colour.discriminant.astype(np.float32)
-    feature = _sample(image, bands, s) @ weights
-    k = np.arange(-kernel_half, kernel_half + 1.0)
-    wide = bands.half_width[:, None]
-    box = ndtr((k + wide) / colour.blur) - ndtr((k - wide) / colour.blur)
-    box -= box.mean(axis=1, keepdims=True)
-    power = np.maximum((box * box).sum(axis=1), 1e-9)
-    box = (box / power[:, None]).astype(np.float32)
-    windows = np.lib.stride_tricks.sliding_window_view(feature, len(k), axis=1)
-    contrast = (windows @ box[:, :, None])[..., 0]
-    # A tape goes on from station to station; a speck does not.
-    pooled = cv2.blur(contrast, (1, 5)) if len(bands) > 5 else contrast
-    best = pooled.argmax(axis=1)
-    rows = np.arange(len(bands))
-    height = contrast[rows, best]
-    # From station to station the tape stays and the noise does not.
-    noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
-    return ProfileFit(
-        best - float(side - kernel_half), np.full(len(bands), 1.0), height.astype(float),
-        height > max(_FOUND * noise, _FOUND_FRACTION))
-
-
-def _sample(
-    image: NDArray[np.uint8], bands: Bands, offsets: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Image values (N, K, 3) at offsets (N, K) across each band, averaged along it."""
-    n, k = offsets.shape
-    across = _as_complex(bands.across)[:, None]
-    t = bands.spacing.astype(np.float32) * _ALONG_SEARCH[:, None]
-    on_curve = _as_complex(bands.centre) + (
-        (0.5 * bands.bend).astype(np.float32) * t * t - 1j * t) * across[:, 0]
-    at = (on_curve[..., None] + offsets * across).astype(np.complex64)
-    values = cv2.remap(
-        image, at.view(np.float32).reshape(len(t), n * k, 2), None, cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE)
-    return cv2.reduce(values, 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).reshape(n, k, 3)
