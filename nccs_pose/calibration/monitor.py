@@ -162,14 +162,16 @@ class CalibrationMonitor:
         self._asked = self._mute = 0
 
     def add(self, estimate: Estimate) -> None:
-        """Look at one answer of the localiser; only tracked ones with two lines count."""
-        if estimate.state is not State.TRACKING or not estimate.pose or not estimate.points:
+        """Look at one answer of the localiser; poses on two lines count, doubted ones too."""
+        pose, points = estimate.pose, estimate.points
+        if estimate.state is not State.TRACKING and estimate.doubted is not None:
+            pose, points = estimate.doubted.pose, estimate.doubted.points
+        if pose is None or not points:
             self._asked, self._mute = self._asked + 1, self._mute + 1
-        else:
-            points = estimate.points[estimate.points.label >= 0]
-            frame = FrameObservation(
-                estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8))
-            self.add_frame(frame, estimate.pose)
+            return
+        points = points[points.label >= 0]
+        self.add_frame(FrameObservation(
+            estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8)), pose)
 
     def add_frame(self, frame: FrameObservation, pose: Pose2) -> None:
         """Look at measurements of one frame and the pose that they gave."""

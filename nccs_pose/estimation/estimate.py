@@ -57,6 +57,18 @@ class Candidate:
     score: float
 
 
+@dataclass(frozen=True, eq=False)
+class Doubted:
+    """A pose that was laid on the image and is not believed; the rig or the map may be to blame.
+
+    :ivar pose: T_map_base.
+    :ivar points: the line pixels it would rest on.
+    """
+
+    pose: Pose2
+    points: LinePoints
+
+
 @dataclass(frozen=True)
 class Quality:
     """Signals of health that a covariance cannot give.
@@ -131,6 +143,7 @@ class Estimate:
     :ivar points: the line pixels it rests on, labelled by the map's lines; None where none.
     :ivar quality: health signals.
     :ivar times: cost by stage.
+    :ivar doubted: the pose that the image does not bear out, where no better one was found.
     """
 
     stamp_ns: int
@@ -142,3 +155,4 @@ class Estimate:
     points: LinePoints | None = None
     quality: Quality = field(default_factory=Quality)
     times: StageTimes = field(default_factory=StageTimes)
+    doubted: Doubted | None = None

@@ -28,7 +28,14 @@ import time
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.alignment import Aligner, Alignment, close
 from nccs_pose.estimation.association import map_symmetries, same_pose
-from nccs_pose.estimation.estimate import Candidate, Estimate, quality_of, StageTimes, State
+from nccs_pose.estimation.estimate import (
+    Candidate,
+    Doubted,
+    Estimate,
+    quality_of,
+    StageTimes,
+    State,
+)
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.hypotheses import (
     ambiguity,
@@ -71,25 +78,25 @@ _PRIOR_GATE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
+class _Refused:
+    """A pose that was laid on the image, and what the image says against it."""
+
+    objection: Objection | None = None
+    alignment: Alignment | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class _Sifted:
     """What a search of the whole image leaves.
 
     :ivar held: poses that explain the image, best first.
     :ivar hidden: poses that would, if something hid the lines that they miss.
-    :ivar objections: against the others, the best first.
+    :ivar refused: the others, the best first.
     """
 
     held: list[Found]
     hidden: list[Candidate]
-    objections: list[Objection]
-
-
-@dataclass(frozen=True, eq=False)
-class _Refused:
-    """The pose that was expected, laid on the image, and what the image says against it."""
-
-    objection: Objection | None = None
-    alignment: Alignment | None = None
+    refused: list[_Refused]
 
 
 class _Stopwatch:
@@ -265,11 +272,9 @@ class Localiser:
             if trusted is not None:
                 return self._tracking(
                     stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
-            against = refused.objection or next(iter(sifted.objections), None)
-            if against is not None and against.line is not None:
-                self._doubts |= {against.line}
-            words = against.words if against is not None else _what_is_missing(segments)
-            return self._without_pose(stamp_ns, prediction, segments, words, watch)
+            if refused.objection is None and sifted.refused:
+                refused = sifted.refused[0]
+            return self._without_pose(stamp_ns, prediction, segments, refused, watch)
         chosen = self._decide(held, prediction)
         if chosen is not None:
             words = 'found by searching the whole image'
@@ -318,7 +323,7 @@ class Localiser:
                 image, alignment, segments, self._doubts,
                 expected=self._expected(alignment.pose, alignment, prediction))
             if isinstance(found, Objection):
-                sifted.objections.append(found)
+                sifted.refused.append(_Refused(found, alignment))
                 if found.hidden:
                     score, _ = self._searcher.score(alignment.pose, segments)
                     sifted.hidden.append(Candidate(alignment.pose, score))
@@ -408,10 +413,15 @@ class Localiser:
 
     def _without_pose(
         self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
-        missing: str, watch: _Stopwatch,
+        refused: _Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
-        track = self._track
+        against, doubted, track = refused.objection, None, self._track
+        missing = against.words if against is not None else _what_is_missing(segments)
+        if against is not None and against.line is not None:
+            self._doubts |= {against.line}
+        if refused.alignment is not None:
+            doubted = Doubted(refused.alignment.pose, refused.alignment.points)
         if track is not None and prediction is not None and prediction.by_odometry and not (
                 self._shaken(prediction, segments)):
             age = (stamp_ns - track.stamp_ns) * 1e-9
@@ -420,12 +430,11 @@ class Localiser:
                 return Estimate(
                     stamp_ns, State.COASTING,
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
-                    prediction.carried, times=watch.times)
+                    prediction.carried, doubted=doubted, times=watch.times)
         state = State.LOST if self._ever_tracked else State.SEARCHING
         return Estimate(
-            stamp_ns, state, missing, times=watch.times,
+            stamp_ns, state, missing, times=watch.times, doubted=doubted,
             candidates=tuple(Candidate(h.pose, h.mean) for h in self._open))
-
 
     def _shaken(self, prediction: Prediction, segments: tuple[FloorSegment, ...]) -> bool:
         """Whether an image shows another place than expected, now or since the last pose."""
