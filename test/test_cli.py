@@ -230,9 +230,14 @@ def test_wrong_input_ends_in_one_sentence(
         assert word in message
 
 
-@pytest.mark.parametrize('name', ['arena.yaml', 'robot.yaml', 'room.yaml'])
-def test_the_node_s_parameter_files_configure_a_replay(name: str) -> None:
-    assert make_options(REPO / 'config' / name, []) == LocaliserOptions()
+@pytest.mark.parametrize(('name', 'calibration_sigma'), [
+    ('arena.yaml', 0.0),  # a simulation knows its camera exactly
+    ('robot.yaml', 0.1), ('room.yaml', 0.1)])
+def test_the_node_s_parameter_files_configure_a_replay(
+    name: str, calibration_sigma: float,
+) -> None:
+    assert make_options(REPO / 'config' / name, []) == LocaliserOptions(
+        calibration_sigma=calibration_sigma)
 
 
 def test_options_come_from_the_file_and_then_from_settings(tmp_path: Path) -> None:
