@@ -255,7 +255,7 @@ def _verdict(
             f'(allowed: {1e3 * options.pose_error:.1f} mm)')
     noise = f'{result.scale:.2f} times the noise that was measured'
     words = (
-        f'to be used: residuals fell from {held_out.before:.3f} px to {held_out.after:.3f} px '
+        f'to be used: residuals went from {held_out.before:.3f} px to {held_out.after:.3f} px '
         f'on {held_out.frames} frames held out from the fit ({noise}); '
         f'{100.0 * first.agreement:.0f} % of the first frames agreed')
     if result.shared > 1.0:
