@@ -70,7 +70,7 @@ def test_a_rough_rig_goes_in_and_a_good_one_comes_out(drive, files, tmp_path, ca
     code = main(['calibrate', str(drive), '--rig', written('rough.yaml', rough), '--map', line_map,
                  '--output', str(output)])
     assert code == 0
-    assert capsys.readouterr().out.startswith('to be used: residuals fell from')
+    assert capsys.readouterr().out.startswith('to be used: residuals went from')
     found = load_rig(output)
     assert np.abs(found.cop - true.cop).max() < 2e-5
     assert found.camera == true.camera

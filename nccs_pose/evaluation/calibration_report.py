@@ -210,8 +210,9 @@ def _histograms(c: Calibration) -> Figure:
         before, after = (_finite(judged.residual_before), _finite(judged.residual_after))
         reach = max(1e-3, 4.0 * robust_deviation(before)) if len(before) else 1.0
         for values, colour, word in ((before, '#b0b0b0', 'before'), (after, '#1f5fa8', 'after')):
-            axes.hist(np.clip(values, -reach, reach), 60, range=(-reach, reach), color=colour, alpha=0.8,
-                      label=word)
+            axes.hist(
+                np.clip(values, -reach, reach), bins=60, range=(-reach, reach), color=colour,
+                alpha=0.8, label=word)
         axes.set_title(name)
         axes.set_xlabel('residual, px')
         axes.legend()
