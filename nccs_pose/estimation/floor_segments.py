@@ -22,8 +22,6 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
-import itertools
 
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
@@ -42,10 +40,15 @@ _LONGEST_GAP = 0.8
 _BESIDE = 0.15
 # So much beside a strip, of what lies in it, is no crossing tape any more.
 _MOST_BESIDE = 0.35
+# Pixels may lie so much further from a tape's midline than half its width, in footprints.
+_FOOTPRINT = 0.75
 # A blob is a single line when no more than this part of it lies beside; of one that is, every
 # so many-th pixel is enough.
 _MISFIT = 0.15
 _THINNED = 4
+# Of a shorter one all pixels are taken; of one with fewer than so many pixels none.
+_SHORT = 60
+_LEAST_LINE = 3
 # Of one that is not, lines are drawn through so many of its pixels and their neighbours within
 # this distance (m, and footprints), and through as many pairs of its pixels; all such blobs have
 # so many of these lines together, and so many pixels.
@@ -81,33 +84,66 @@ class FloorSegment:
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Floor points with their Jacobian by the pixel, blob and weight."""
+    """P floor points of line-coloured pixels, blob after blob.
+
+    :ivar floor: (P, 2), metres.
+    :ivar spread: the three elements of J J^T, J the point's derivative by the pixel (3, P).
+    :ivar precision: weight in a fit (P,): far pixels cover much floor and say little.
+    :ivar blob: of each (P,), ascending.
+    :ivar weight: how many pixels each stands for (P,).
+    """
 
     floor: Array
-    jacobian: Array
+    spread: Array
+    precision: Array
     blob: NDArray[np.intp]
     weight: Array
 
-    def __getitem__(self, index: NDArray[np.intp] | slice) -> _Points:
-        return _Points(
-            self.floor[index], self.jacobian[index], self.blob[index], self.weight[index])
-
-    def tolerance(self, normal: Array, width: float) -> Array:
-        """How far from a tape's midline its pixels may be (..., P), for normals (..., 2)."""
-        # |J^T n|^2 = n^T (J J^T) n: one matrix product for all normals and points.
-        square = np.stack(
-            [normal[..., 0] ** 2, 2.0 * normal[..., 0] * normal[..., 1], normal[..., 1] ** 2],
-            axis=-1)
-        footprint = np.sqrt(np.maximum(square @ self.spread, 0.0))
-        return 0.5 * width + 0.75 * footprint + 0.005
-
-    @cached_property
-    def spread(self) -> Array:
-        """The three elements of the symmetric J J^T (3, P)."""
-        by_u, by_v = self.jacobian[:, :, 0], self.jacobian[:, :, 1]
-        return np.stack([
+    @classmethod
+    def of(cls, segmentation: Segmentation, table: FloorTable, width: float) -> _Points:
+        floor, jacobian = table.floor(segmentation.pixels)
+        by_u, by_v = jacobian[:, :, 0], jacobian[:, :, 1]
+        spread = np.stack([
             by_u[:, 0] ** 2 + by_v[:, 0] ** 2, by_u[:, 0] * by_u[:, 1] + by_v[:, 0] * by_v[:, 1],
             by_u[:, 1] ** 2 + by_v[:, 1] ** 2])
+        precision = 1.0 / (spread[0] + spread[2] + 0.1 * width**2)
+        return cls(floor, spread, precision, segmentation.label, segmentation.weight)
+
+    def __getitem__(self, index: NDArray[np.intp] | slice) -> _Points:
+        return _Points(
+            self.floor[index], self.spread[:, index], self.precision[index], self.blob[index],
+            self.weight[index])
+
+    def beyond(self, normal: Array, offset: float | Array, width: float) -> Array:
+        """How far the points are from being a tape's (P,), metres; below 0 they may be.
+
+        :param normal: of the tape's midline (2,), or one for each point (P, 2).
+        :param offset: of the midline, or one for each point (P,).
+        """
+        x, y = normal[..., 0], normal[..., 1]
+        # |J^T n|^2 = n^T (J J^T) n.
+        square = (x * x) * self.spread[0] + (2.0 * x * y) * self.spread[1] + (
+            y * y) * self.spread[2]
+        distance = np.abs(x * self.floor[:, 0] + y * self.floor[:, 1] - offset)
+        return distance - _FOOTPRINT * np.sqrt(np.maximum(square, 0.0)) - _half(width)
+
+    def near(self, normals: Array, offsets: Array, width: float) -> NDArray[np.float32]:
+        """1 where a point may be one of a tape's along each of C lines (P, C), else 0."""
+        x, y = normals.T.astype(np.float32)
+        square = self.spread.T.astype(np.float32) @ np.stack([x * x, 2.0 * x * y, y * y])
+        distance = self.floor.astype(np.float32) @ np.stack([x, y])
+        distance -= offsets.astype(np.float32)
+        np.abs(distance, out=distance)
+        distance -= np.float32(_half(width))
+        np.maximum(distance, 0.0, out=distance)
+        np.square(distance, out=distance)
+        square *= np.float32(_FOOTPRINT**2)
+        return (distance <= square).astype(np.float32)
+
+
+def _half(width: float) -> float:
+    """How far from a tape's midline a point of its floor may be, metres."""
+    return 0.5 * width + 0.005
 
 
 def floor_segments(
@@ -121,36 +157,36 @@ def floor_segments(
     """
     if len(segmentation.pixels) == 0:
         return ()
-    floor, jacobian = table.floor(segmentation.pixels)
-    points = _Points(floor, jacobian, segmentation.label, segmentation.weight)
+    points = _Points.of(segmentation, table, width)
     normals, offsets, kept = _candidates(points, width)
-    points, floor, pixels = points[kept], floor[kept], segmentation.pixels[kept]
+    if len(normals) == 0:
+        return ()
+    points, pixels = points[kept], segmentation.pixels[kept]
     # What is left of a thinned blob stands for all of it.
-    share = np.bincount(segmentation.label) / np.maximum(np.bincount(points.blob), 1)
+    share = np.bincount(segmentation.label) / np.maximum(np.bincount(
+        points.blob, minlength=int(segmentation.label[-1]) + 1), 1)
     points = replace(points, weight=points.weight * share[points.blob])
-    free = np.ones(len(floor), dtype=bool)
+    near = points.near(normals, offsets, width)
+    support = (points.weight.astype(np.float32) @ near).astype(float)
+    free = np.ones(len(points.floor), dtype=bool)
     segments: list[FloorSegment] = []
-    distance = np.abs(normals @ floor.T - offsets[:, None])
-    near = distance < points.tolerance(normals, width)
-    worth = near.astype(np.float32)
-    alive = np.ones(len(normals), dtype=bool)
-    while len(segments) < most and alive.any():
-        support = np.where(alive, worth @ (points.weight * free).astype(np.float32), 0.0)
+    while len(segments) < most:
         best = int(support.argmax())
-        alive[best] = False
         if support[best] < _LEAST_PIXELS:
             break
-        found = _strip(points, free, near[best] & free, normals[best], width)
+        support[best] = -np.inf
+        found = _strip(points, free, np.flatnonzero((near[:, best] > 0.0) & free), width)
         if found is None:
             continue
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
-            segments.append(_segment(
-                points, pixels, inside, normal, offset, colour))
+            segments.append(_segment(points, pixels, inside, normal, offset, colour))
+            taken = inside
         else:
             # What is left of a solid must not pass for a thinner thing.
-            free &= ~beside
-        free &= ~inside
+            taken = np.union1d(inside, beside[free[beside]])
+        free[taken] = False
+        support -= points.weight[taken].astype(np.float32) @ near[taken]
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
 
@@ -162,133 +198,151 @@ def _candidates(
 
     Each blob's own line, and where that does not fit, those through some of its pixels.
     """
-    normals: list[Array] = []
-    offsets: list[float] = []
-    kept, tangled = [], []
-    bounds = np.flatnonzero(np.diff(points.blob, prepend=-1, append=-1))
-    for first, last in itertools.pairwise(bounds.tolist()):
-        part = points[first:last]
-        if last - first < 3:
-            continue
-        normal, offset = _fit(part.floor, _precision(part.jacobian, width))
-        normals.append(normal)
-        offsets.append(offset)
-        misfit = np.abs(part.floor @ normal - offset) > part.tolerance(normal, width)
-        if misfit.mean() <= _MISFIT or last - first < _LEAST_PIXELS:
-            kept.append(np.arange(first, last, 1 if last - first < 60 else _THINNED))
-        else:
-            tangled.append((first, last))
+    first = np.flatnonzero(np.diff(points.blob, prepend=-1))
+    size = np.diff(first, append=len(points.blob))
+    number = np.repeat(np.arange(len(first)), size)
+    own, own_offset = _blob_lines(points, first, number)
+    off = points.beyond(own[number], own_offset[number], width) > 0.0
+    misfit = np.add.reduceat(off.astype(float), first) / size
+    speck = size < _LEAST_LINE
+    tangled = ~speck & (size >= _LEAST_PIXELS) & (misfit > _MISFIT)
+    count = int(tangled.sum())
+    step = 1 + int(size[tangled].sum()) // _MOST_PIXELS
+    stride = np.where(tangled, step, np.where(size < _SHORT, 1, _THINNED))
+    kept = ((np.arange(len(number)) - first[number]) % stride[number] == 0) & ~speck[number]
     rng = np.random.default_rng(0)
-    step = 1 + sum(last - first for first, last in tangled) // _MOST_PIXELS
-    seeds = max(1, min(_SEEDS, _MOST_SEEDS // max(1, len(tangled))))
-    for first, last in tangled:
-        kept.append(np.arange(first, last, step))
-        part = points[first:last:step]
-        for normal, offset in (
-                *_through_neighbours(part, width, seeds), *_through_pairs(part, rng, seeds)):
-            normals.append(normal)
-            offsets.append(offset)
-    index = np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.intp)
-    return np.array(normals).reshape(-1, 2), np.array(offsets), index
+    seeds = max(1, min(_SEEDS, _MOST_SEEDS // max(1, count)))
+    lines = [(own[~speck], own_offset[~speck])]
+    for k in np.flatnonzero(tangled).tolist():
+        part = points[first[k]:first[k] + size[k]:step]
+        lines += [_through_neighbours(part, seeds), _through_pairs(part, rng, seeds)]
+    normals, offsets = (np.concatenate(parts) for parts in zip(*lines))
+    return normals, offsets, np.flatnonzero(kept)
 
 
-def _through_neighbours(
-    part: _Points, width: float, seeds: int,
-) -> list[tuple[Array, float]]:
+def _blob_lines(
+    points: _Points, first: NDArray[np.intp], number: NDArray[np.intp],
+) -> tuple[Array, Array]:
+    """Each blob's own line: normals (B, 2) and offsets (B,).
+
+    :param first: where each blob begins (B,).
+    :param number: of each point's blob among them (P,).
+    """
+    weight = points.precision
+    total = np.add.reduceat(weight, first)[:, None]
+    mean = np.add.reduceat(weight[:, None] * points.floor, first) / total
+    moved = points.floor - mean[number]
+    second = np.add.reduceat(weight[:, None] * _squares(moved), first)
+    return _principal(mean, second)
+
+
+def _through_neighbours(part: _Points, seeds: int) -> tuple[Array, Array]:
     """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
-    lines = []
-    precision = _precision(part.jacobian, width)
-    footprint = np.sqrt(0.5 * (part.spread[0] + part.spread[2]))
-    for k in range(0, len(part.floor), max(1, len(part.floor) // seeds)):
-        reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint[k]
-        offset = part.floor - part.floor[k]
-        near = np.einsum('pi,pi->p', offset, offset) < reach**2
-        if near.sum() >= 3:
-            lines.append(_fit(part.floor[near], precision[near]))
-    return lines
+    seed = np.arange(0, len(part.floor), max(1, len(part.floor) // seeds))
+    footprint = np.sqrt(0.5 * (part.spread[0, seed] + part.spread[2, seed]))
+    reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint
+    x, y = part.floor.T
+    near = np.square(x - x[seed, None]) + np.square(y - y[seed, None]) < np.square(reach)[:, None]
+    near = near[near.sum(axis=1) >= _LEAST_LINE]
+    weight = near * part.precision
+    moved = part.floor - part.floor.mean(axis=0)
+    sums = weight @ np.column_stack([np.ones(len(moved)), moved, _squares(moved)])
+    mean = sums[:, 1:3] / sums[:, :1]
+    second = sums[:, 3:] - sums[:, :1] * _squares(mean)
+    return _principal(mean + part.floor.mean(axis=0), second)
 
 
 def _through_pairs(
     part: _Points, rng: np.random.Generator, seeds: int,
-) -> list[tuple[Array, float]]:
+) -> tuple[Array, Array]:
     """Lines through random pairs of a blob's pixels."""
     pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2))]
     along = pair[:, 1] - pair[:, 0]
-    length = np.linalg.norm(along, axis=1)
+    length = np.hypot(along[:, 0], along[:, 1])
     pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
     across = np.column_stack([-along[:, 1], along[:, 0]])
-    return list(zip(across, np.einsum('ni,ni->n', across, pair[:, 0]).tolist()))
+    return across, np.einsum('ni,ni->n', across, pair[:, 0])
 
 
-def _precision(jacobian: Array, width: float) -> Array:
-    """Weight of floor points (P,): far pixels cover much floor and say little."""
-    return 1.0 / (np.einsum('pij,pij->p', jacobian, jacobian) + 0.1 * width**2)
+def _squares(points: Array) -> Array:
+    """xx, xy and yy of points (N, 2) as (N, 3)."""
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([x * x, x * y, y * y])
+
+
+def _principal(mean: Array, second: Array) -> tuple[Array, Array]:
+    """Total least squares lines: unit normals (K, 2) and offsets (K,).
+
+    :param mean: centres of gravity (K, 2).
+    :param second: xx, xy and yy about them (K, 3).
+    """
+    # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
+    angle = 0.5 * np.arctan2(2.0 * second[:, 1], second[:, 0] - second[:, 2])
+    normal = np.column_stack([-np.sin(angle), np.cos(angle)])
+    return normal, np.einsum('ki,ki->k', normal, mean)
 
 
 def _fit(floor: Array, weight: Array) -> tuple[Array, float]:
-    """Total least squares line: unit normal (2,) and offset."""
+    """Total least squares line through points (M, 2): unit normal (2,) and offset."""
     mean = weight @ floor / weight.sum()
-    moved = floor - mean
-    xx, yy = weight @ moved[:, 0] ** 2, weight @ moved[:, 1] ** 2
-    xy = weight @ (moved[:, 0] * moved[:, 1])
-    # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    normal = np.array([-np.sin(angle), np.cos(angle)])
-    return normal, float(normal @ mean)
+    normal, offset = _principal(mean[None], (weight @ _squares(floor - mean))[None])
+    return normal[0], float(offset[0])
 
 
 def _strip(
-    points: _Points, free: NDArray[np.bool_], inside: NDArray[np.bool_], normal: Array,
-    width: float,
-) -> tuple[Array, float, NDArray[np.bool_], NDArray[np.bool_]] | None:
+    points: _Points, free: NDArray[np.bool_], inside: NDArray[np.intp], width: float,
+) -> tuple[Array, float, NDArray[np.intp], NDArray[np.intp]] | None:
     """Refine a strip on its own pixels.
 
-    :returns: normal, offset, its pixels (P,) and those of its blobs that lie just beside it (P,);
-        None where too little is left.
+    :param inside: points to start from.
+    :returns: normal, offset, its points and those of its blobs that lie just beside it; None
+        where too little is left.
     """
-    offset = 0.0
     for _ in range(2):
-        normal, offset = _fit(
-            points.floor[inside], _precision(points.jacobian[inside], width))
-        across = np.abs(points.floor @ normal - offset)
-        tolerance = points.tolerance(normal, width)
-        inside = _longest_run(points, normal, free & (across < tolerance))
-        if inside.sum() < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
+        normal, offset = _fit(points.floor[inside], points.precision[inside])
+        beyond = points.beyond(normal, offset, width)
+        direction = np.array([-normal[1], normal[0]])
+        along = points.floor @ direction
+        inside = _longest_run(points, along, np.flatnonzero(free & (beyond < 0.0)))
+        if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
-    along = points.floor @ np.array([-normal[1], normal[0]])
     low, high = along[inside].min(), along[inside].max()
     if high - low < _LEAST_LENGTH:
         return None
     # Only what hangs together with the strip counts: another tape may well cross it.
-    own = np.isin(points.blob, np.unique(points.blob[inside]))
-    beside = (own & (across > tolerance) & (across < tolerance + _BESIDE)
-              & (along > low) & (along < high))
-    return normal, offset, inside, beside
+    own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
+    own[points.blob[inside]] = True
+    beside = np.flatnonzero((beyond > 0.0) & (beyond < _BESIDE) & (along > low) & (along < high))
+    return normal, offset, inside, beside[own[points.blob[beside]]]
 
 
 def _longest_run(
-    points: _Points, normal: Array, inside: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """Of a strip's pixels those of its heaviest part without a long gap (P,)."""
-    index = np.flatnonzero(inside)
-    if len(index) == 0:
+    points: _Points, along: Array, inside: NDArray[np.intp],
+) -> NDArray[np.intp]:
+    """Of a strip's points those of its heaviest part without a long gap.
+
+    :param along: the strip's direction, of all points (P,), metres.
+    """
+    if len(inside) == 0:
         return inside
-    along = points.floor[index] @ np.array([-normal[1], normal[0]])
-    order = np.argsort(along, kind='stable')
-    part = np.concatenate([[0], np.cumsum(np.diff(along[order]) > _LONGEST_GAP)])
-    mass = np.bincount(part, weights=points.weight[index[order]])
-    result = np.zeros_like(inside)
-    result[index[order[part == mass.argmax()]]] = True
-    return result
+    order = inside[np.argsort(along[inside], kind='stable')]
+    gaps = np.flatnonzero(np.diff(along[order]) > _LONGEST_GAP) + 1
+    if len(gaps) == 0:
+        return inside
+    bounds = np.concatenate([[0], gaps])
+    heaviest = int(np.add.reduceat(points.weight[order], bounds).argmax())
+    return np.sort(np.split(order, gaps)[heaviest])
 
 
 def _segment(
-    points: _Points, pixels: Array, inside: NDArray[np.bool_], normal: Array, offset: float,
+    points: _Points, pixels: Array, inside: NDArray[np.intp], normal: Array, offset: float,
     colour: str,
 ) -> FloorSegment:
     direction = np.array([-normal[1], normal[0]])
     along = points.floor[inside] @ direction
-    footprint = np.linalg.norm(points.jacobian[inside].transpose(0, 2, 1) @ normal, axis=1)
+    x, y = normal
+    footprint = np.sqrt(np.maximum(
+        np.array([x * x, 2.0 * x * y, y * y]) @ points.spread[:, inside], 0.0))
     return FloorSegment(
         normal, offset, offset * normal + along.min() * direction,
         offset * normal + along.max() * direction, float(points.weight[inside].sum()),
