@@ -22,6 +22,7 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
@@ -49,6 +50,8 @@ _THINNED = 4
 # Of a shorter one all pixels are taken; of one with fewer than so many pixels none.
 _SHORT = 60
 _LEAST_LINE = 3
+# Points looked at together.
+_BLOCK = 256
 # Of one that is not, lines are drawn through so many of its pixels and their neighbours within
 # this distance (m, and footprints), and through as many pairs of its pixels; all such blobs have
 # so many of these lines together, and so many pixels.
@@ -114,31 +117,39 @@ class _Points:
             self.floor[index], self.spread[:, index], self.precision[index], self.blob[index],
             self.weight[index])
 
-    def beyond(self, normal: Array, offset: float | Array, width: float) -> Array:
+    def footprint(self, normal: Array) -> Array:
+        """How far each pixel reaches along a normal (2,), or each along its own (P, 2) (P,)."""
+        x, y = normal[..., 0], normal[..., 1]
+        # |J^T n|^2 = n^T (J J^T) n.
+        form = np.array([x * x, 2.0 * x * y, y * y])
+        square = form @ self.spread if normal.ndim == 1 else (form * self.spread).sum(axis=0)
+        return np.sqrt(np.maximum(square, 0.0))
+
+    def beyond(self, normal: Array, distance: Array, width: float) -> Array:
         """How far the points are from being a tape's (P,), metres; below 0 they may be.
 
         :param normal: of the tape's midline (2,), or one for each point (P, 2).
-        :param offset: of the midline, or one for each point (P,).
+        :param distance: of each point from the midline (P,), of either sign.
         """
-        x, y = normal[..., 0], normal[..., 1]
-        # |J^T n|^2 = n^T (J J^T) n.
-        square = (x * x) * self.spread[0] + (2.0 * x * y) * self.spread[1] + (
-            y * y) * self.spread[2]
-        distance = np.abs(x * self.floor[:, 0] + y * self.floor[:, 1] - offset)
-        return distance - _FOOTPRINT * np.sqrt(np.maximum(square, 0.0)) - _half(width)
+        return np.abs(distance) - _FOOTPRINT * self.footprint(normal) - _half(width)
 
     def near(self, normals: Array, offsets: Array, width: float) -> NDArray[np.float32]:
         """1 where a point may be one of a tape's along each of C lines (P, C), else 0."""
         x, y = normals.T.astype(np.float32)
-        square = self.spread.T.astype(np.float32) @ np.stack([x * x, 2.0 * x * y, y * y])
-        distance = self.floor.astype(np.float32) @ np.stack([x, y])
-        distance -= offsets.astype(np.float32)
-        np.abs(distance, out=distance)
-        distance -= np.float32(_half(width))
-        np.maximum(distance, 0.0, out=distance)
-        np.square(distance, out=distance)
-        square *= np.float32(_FOOTPRINT**2)
-        return (distance <= square).astype(np.float32)
+        by_spread = np.float32(_FOOTPRINT**2) * np.stack([x * x, 2.0 * x * y, y * y])
+        by_floor = np.stack([x, y, -offsets.astype(np.float32)])
+        floor = np.column_stack([self.floor, np.ones(len(self.floor))]).astype(np.float32)
+        spread = self.spread.T.astype(np.float32)
+        near = np.empty((len(floor), len(normals)), np.float32)
+        # In blocks that stay in the processor's cache.
+        for first in range(0, len(floor), _BLOCK):
+            block = slice(first, first + _BLOCK)
+            distance = np.abs(floor[block] @ by_floor)
+            distance -= np.float32(_half(width))
+            np.maximum(distance, 0.0, out=distance)
+            np.square(distance, out=distance)
+            np.less_equal(distance, spread[block] @ by_spread, out=near[block], casting='unsafe')
+        return near
 
 
 def _half(width: float) -> float:
@@ -202,7 +213,9 @@ def _candidates(
     size = np.diff(first, append=len(points.blob))
     number = np.repeat(np.arange(len(first)), size)
     own, own_offset = _blob_lines(points, first, number)
-    off = points.beyond(own[number], own_offset[number], width) > 0.0
+    normal = own[number]
+    distance = np.einsum('pi,pi->p', points.floor, normal) - own_offset[number]
+    off = points.beyond(normal, distance, width) > 0.0
     misfit = np.add.reduceat(off.astype(float), first) / size
     speck = size < _LEAST_LINE
     tangled = ~speck & (size >= _LEAST_PIXELS) & (misfit > _MISFIT)
@@ -283,10 +296,18 @@ def _principal(mean: Array, second: Array) -> tuple[Array, Array]:
 
 
 def _fit(floor: Array, weight: Array) -> tuple[Array, float]:
-    """Total least squares line through points (M, 2): unit normal (2,) and offset."""
-    mean = weight @ floor / weight.sum()
-    normal, offset = _principal(mean[None], (weight @ _squares(floor - mean))[None])
-    return normal[0], float(offset[0])
+    """Total least squares line through points (M, 2): unit normal (2,) and offset.
+
+    One line in plain numbers: arrays of one are slow.
+    """
+    x, y = floor[:, 0], floor[:, 1]
+    total = weight.sum()
+    mean_x, mean_y = weight @ x / total, weight @ y / total
+    x, y = x - mean_x, y - mean_y
+    by_x = weight * x
+    angle = 0.5 * math.atan2(2.0 * (by_x @ y), by_x @ x - (weight * y) @ y)
+    normal = np.array([-math.sin(angle), math.cos(angle)])
+    return normal, float(normal[0] * mean_x + normal[1] * mean_y)
 
 
 def _strip(
@@ -300,7 +321,7 @@ def _strip(
     """
     for _ in range(2):
         normal, offset = _fit(points.floor[inside], points.precision[inside])
-        beyond = points.beyond(normal, offset, width)
+        beyond = points.beyond(normal, points.floor @ normal - offset, width)
         direction = np.array([-normal[1], normal[0]])
         along = points.floor @ direction
         inside = _longest_run(points, along, np.flatnonzero(free & (beyond < 0.0)))
@@ -340,10 +361,7 @@ def _segment(
 ) -> FloorSegment:
     direction = np.array([-normal[1], normal[0]])
     along = points.floor[inside] @ direction
-    x, y = normal
-    footprint = np.sqrt(np.maximum(
-        np.array([x * x, 2.0 * x * y, y * y]) @ points.spread[:, inside], 0.0))
     return FloorSegment(
         normal, offset, offset * normal + along.min() * direction,
         offset * normal + along.max() * direction, float(points.weight[inside].sum()),
-        float(np.median(footprint)), pixels[inside], colour)
+        float(np.median(points[inside].footprint(normal))), pixels[inside], colour)

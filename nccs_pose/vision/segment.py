@@ -142,14 +142,17 @@ def find_blobs(mask: Mask, pixels_per_blob: int) -> Segmentation:
     filled = np.zeros_like(closed)
     for number, contour in enumerate(kept, start=1):
         cv2.drawContours(filled, [contour], -1, number, cv2.FILLED)
-    found = cv2.findNonZero(cv2.bitwise_and(filled, closed))
-    points = np.zeros((0, 2), np.intp) if found is None else found.reshape(-1, 2)
-    blob = filled[points[:, 1], points[:, 0]].astype(np.intp) - 1
-    order = np.argsort(blob, kind='stable')
-    points, blob = points[order], blob[order]
+    cv2.bitwise_and(filled, closed, dst=filled)
+    place = np.flatnonzero(filled != 0)
+    number_of = filled.ravel()[place]
+    # Of bytes the stable order costs one pass.
+    order = np.argsort(number_of, kind='stable')
+    blob = number_of[order].astype(np.intp) - 1
     size = np.bincount(blob, minlength=len(kept))
     stride = np.maximum(1, size // pixels_per_blob)
     first = np.cumsum(size) - size
-    chosen = (np.arange(len(blob)) - first[blob]) % stride[blob] == 0
+    chosen = np.flatnonzero((np.arange(len(blob)) - first[blob]) % stride[blob] == 0)
+    row, column = np.divmod(place[order[chosen]], mask.shape[1])
     return Segmentation(
-        closed, points[chosen].astype(float), blob[chosen], stride[blob[chosen]].astype(float))
+        closed, np.column_stack([column, row]).astype(float), blob[chosen],
+        stride[blob[chosen]].astype(float))
