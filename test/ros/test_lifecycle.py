@@ -34,13 +34,13 @@ ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.
 ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
 
 
-def state(user) -> int:
-    return user.call(GetState, '/localiser/get_state', GetState.Request()).current_state.id
+def state(user, node: str = 'localiser') -> int:
+    return user.call(GetState, f'/{node}/get_state', GetState.Request()).current_state.id
 
 
-def change(user, transition: int, label: str = '') -> bool:
+def change(user, transition: int, label: str = '', node: str = 'localiser') -> bool:
     request = ChangeState.Request(transition=Transition(id=transition, label=label))
-    return user.call(ChangeState, '/localiser/change_state', request).success
+    return user.call(ChangeState, f'/{node}/change_state', request).success
 
 
 def test_full_cycle_and_transitions_that_are_not_allowed(world):
@@ -68,26 +68,32 @@ def test_full_cycle_and_transitions_that_are_not_allowed(world):
     assert node.stop(signal.SIGINT) == 0, node.output
 
 
-@pytest.mark.parametrize(('changed', 'words'), [
+BAD_CONFIGURATIONS = [
     ({'map_file': 'nowhere/map.yaml'}, 'nowhere/map.yaml'),
     ({'rig_file': 'config/room_map.yaml'}, 'room_map.yaml'),
     ({'rig_file': None}, 'rig_file is not set'),
     ({'tf_mode': 'map_to_moon'}, 'tf_mode'),
     ({'camera_info_tolerance': 7.5}, 'camera_info_tolerance'),
     ({'silence_warning': 'soon'}, 'silence_warning'),
-])
-def test_bad_configuration_fails_with_the_reason_and_the_node_lives(world, changed, words):
-    node, user = world.localiser(**{**ROOM, **changed}), world.user
-    status = user.wait(lambda: user.statuses.get('localiser: pose'))
-    assert status, node.output
-    assert words in status.message
-    assert status.level == b'\x02'
-    assert words in node.output
-    assert state(user) == State.PRIMARY_STATE_UNCONFIGURED
-    assert not change(user, Transition.TRANSITION_CONFIGURE)
-    relocalise = user.call(Trigger, '/localiser/relocalise', Trigger.Request())
-    assert not relocalise.success
-    assert node.stop(signal.SIGTERM) == 0, node.output
+]
+
+
+def test_bad_configuration_fails_with_the_reason_and_the_node_lives(world):
+    user = world.user
+    nodes = [world.localiser('-r', f'__ns:=/n{k}', **{**ROOM, **changed})
+             for k, (changed, _) in enumerate(BAD_CONFIGURATIONS)]
+    for k, (node, (_, words)) in enumerate(zip(nodes, BAD_CONFIGURATIONS)):
+        name = f'n{k}/localiser'
+        status = user.wait(lambda n=name: user.statuses.get(f'{n}: pose'))
+        assert status, node.output
+        assert words in status.message
+        assert status.level == b'\x02'
+        assert words in node.output
+        assert state(user, name) == State.PRIMARY_STATE_UNCONFIGURED
+        assert not change(user, Transition.TRANSITION_CONFIGURE, node=name)
+        relocalise = user.call(Trigger, f'/{name}/relocalise', Trigger.Request())
+        assert not relocalise.success
+        assert node.stop(signal.SIGTERM) == 0, node.output
 
 
 def test_transforms_without_tf2_ros_fail_with_the_reason(world):
