@@ -22,6 +22,7 @@ explains the image, best first.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -148,52 +149,73 @@ def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
 
 def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array:
     """Poses (H, 3) that lay a pair of strips on a pair of map lines."""
+    if len(segments) < 2:
+        return np.zeros((0, 3))
     map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
-    a, b = (index.ravel() for index in np.indices((len(map_angle), len(map_angle))))
-    between_lines = map_angle[a] - map_angle[b]
-    same_colour = {
-        s.colour: np.array([colour == s.colour for colour in lines.colour]) for s in segments}
+    angle = np.array([math.atan2(-s.normal[0], s.normal[1]) for s in segments])
+    alike = np.array([[s.colour == colour for colour in lines.colour] for s in segments])
+    first, second = np.triu_indices(len(segments), 1)
+    between = angle[first] - angle[second]
+    crossing = np.abs(np.sin(between)) >= math.sin(_CROSSING)
+    first, second, between = first[crossing], second[crossing], between[crossing]
+    off = np.subtract.outer(map_angle, map_angle) - between[:, None, None]
+    match = (np.abs(np.sin(off)) < math.sin(_ANGLE_GATE)) & ~np.eye(len(map_angle), dtype=bool)
+    match &= alike[first][:, :, None] & alike[second][:, None, :]
+    pair, a, b = np.nonzero(match)
+    first, second = first[pair], second[pair]
+    yaw = map_angle[a] - angle[first] + 0.25 * np.sin(2.0 * (
+        map_angle[b] - map_angle[a] + angle[first] - angle[second]))
+    strips = _Strips(np.array([s.start for s in segments]), np.array([s.end for s in segments]))
     poses: list[Array] = []
-    for i, first in enumerate(segments):
-        for second in segments[i + 1:]:
-            if sum(map(len, poses)) > _ENOUGH:
-                break
-            angles = [np.arctan2(-s.normal[0], s.normal[1]) for s in (first, second)]
-            between = angles[0] - angles[1]
-            if abs(np.sin(between)) < np.sin(_CROSSING):
-                continue
-            match = np.abs(np.sin(between_lines - between)) < np.sin(_ANGLE_GATE)
-            match &= (a != b) & same_colour[first.colour][a] & same_colour[second.colour][b]
-            for turn in (0.0, np.pi):
-                yaw_a = map_angle[a[match]] - angles[0] + turn
-                off = np.sin(2.0 * (map_angle[b[match]] - angles[1] - yaw_a)) / 2.0
-                poses.append(_intersect(
-                    yaw_a + 0.5 * off, first, second, a[match], b[match], lines))
+    for begin in range(0, len(pair), _ENOUGH // 2):
+        part = slice(begin, begin + _ENOUGH // 2)
+        for turn in (0.0, np.pi):
+            poses.append(_intersect(
+                yaw[part] + turn, strips[first[part]], strips[second[part]], a[part], b[part],
+                lines))
+        if sum(map(len, poses)) > _ENOUGH:
+            break
     return np.concatenate(poses) if poses else np.zeros((0, 3))
 
 
+@dataclass(frozen=True, eq=False)
+class _Strips:
+    """Ends of strips in base_link, (S, 2) each."""
+
+    start: Array
+    end: Array
+
+    def __getitem__(self, index: NDArray[np.intp]) -> _Strips:
+        return _Strips(self.start[index], self.end[index])
+
+
 def _intersect(
-    yaw: Array, first: FloorSegment, second: FloorSegment, a: NDArray[np.intp],
-    b: NDArray[np.intp], lines: _FloorLines,
+    yaw: Array, first: _Strips, second: _Strips, a: NDArray[np.intp], b: NDArray[np.intp],
+    lines: _FloorLines,
 ) -> Array:
-    """Poses (K, 3) that put the strips' middles on lines a and b (K,), where the extents agree."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    rotation = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], axis=1)
-    matrix = np.stack([lines.normal[a], lines.normal[b]], axis=1)
-    right = np.stack([
-        lines.offset[line] - np.einsum(
-            'ki,kij,j->k', lines.normal[line], rotation, 0.5 * (strip.start + strip.end))
-        for strip, line in ((first, a), (second, b))], axis=1)
-    t = np.linalg.solve(matrix, right[..., None])[..., 0]
+    """Poses (K, 3) that put K strips' middles on lines a and b (K,), where the extents agree."""
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+
+    def turned(points: Array) -> Array:
+        return np.hstack([c * points[:, :1] - s * points[:, 1:],
+                          s * points[:, :1] + c * points[:, 1:]])
+
+    ends = [(turned(strip.start), turned(strip.end)) for strip in (first, second)]
+    n_a, n_b = lines.normal[a], lines.normal[b]
+    right_a, right_b = (
+        lines.offset[line] - 0.5 * np.einsum('ki,ki->k', lines.normal[line], start + end)
+        for line, (start, end) in zip((a, b), ends))
+    det = n_a[:, 0] * n_b[:, 1] - n_a[:, 1] * n_b[:, 0]
+    t = np.column_stack([n_b[:, 1] * right_a - n_a[:, 1] * right_b,
+                         n_a[:, 0] * right_b - n_b[:, 0] * right_a]) / det[:, None]
     fits = np.ones(len(yaw), dtype=bool)
-    for strip, line in ((first, a), (second, b)):
-        along = np.sort([np.einsum(
-            'ki,ki->k', lines.direction[line], rotation @ end + t - lines.start[line])
-            for end in (strip.start, strip.end)], axis=0)
-        outside = (np.maximum(-along[0], 0.0)
-                   + np.maximum(along[1] - lines.length[line], 0.0))
+    for (start, end), line in zip(ends, (a, b)):
+        origin, direction = t - lines.start[line], lines.direction[line]
+        one, other = (np.einsum('ki,ki->k', direction, at + origin) for at in (start, end))
+        outside = (np.maximum(-np.minimum(one, other), 0.0)
+                   + np.maximum(np.maximum(one, other) - lines.length[line], 0.0))
         # Something in line with a tape may have been joined to it.
-        fits &= outside < _BEYOND + _JOINED * np.linalg.norm(strip.end - strip.start)
+        fits &= outside < _BEYOND + _JOINED * np.hypot(*(end - start).T)
     return np.column_stack([t, yaw])[fits]
 
 
