@@ -28,25 +28,37 @@ import numpy as np
 
 
 class State(Enum):
-    """How much the localiser knows. Words in *stars* are its options; their numbers are there."""
+    """How much the localiser knows.
 
-    SEARCHING = 'searching'
-    """No pose was ever held: nothing in the images so far fits the map. None is given."""
-    AMBIGUOUS = 'ambiguous'
-    """Two poses or more explain the image, and the second scores more than *ambiguity_ratio* of
-    the best, in the mean of all images since they were first seen. All are candidates, none is
-    given."""
-    TRACKING = 'tracking'
-    """The pose explains the image: at least *least_explained* of the predicted line pixels are
-    found, no line and no stretch of lines lies off by more than *largest_misfit*, no line is seen
-    beside its place; and it lies within *innovation_gate* of the prediction (3 deviations where it
-    rests on fewer than three lines), or two images in a row agree on it.
+    :ivar meaning: the definition, in words; those in `code` are options, their numbers are there.
     """
-    COASTING = 'coasting'
-    """The image says too little; the last pose is carried on by odometry, for *coast_time* at most
-    and up to *coast_sigma*, unless an image shows another place."""
-    LOST = 'lost'
-    """There was a pose, and it neither explains the image nor can be carried on. None is given."""
+
+    meaning: str
+
+    def __new__(cls, word: str, meaning: str) -> State:
+        state = object.__new__(cls)
+        state._value_ = word
+        state.meaning = meaning
+        return state
+
+    SEARCHING = 'searching', (
+        'No pose was ever held: nothing in the images so far fits the map. None is given.')
+    AMBIGUOUS = 'ambiguous', (
+        'Two poses or more explain the image, and the second scores more than `ambiguity_ratio` '
+        'of the best, in the mean of all images since they were first seen. All are candidates, '
+        'none is given.')
+    TRACKING = 'tracking', (
+        'The pose explains the image: at least `least_explained` of the predicted line pixels '
+        'are found, no line and no stretch of lines lies off by more than `largest_misfit`, no '
+        'line is seen beside its place; and it lies within `innovation_gate` of the prediction '
+        '(3 deviations where it rests on fewer than three lines), or two images in a row agree '
+        'on it.')
+    COASTING = 'coasting', (
+        'The image says too little; the last pose is carried on by odometry, for `coast_time` at '
+        'most and up to `coast_sigma`, unless an image shows another place.')
+    LOST = 'lost', (
+        'There was a pose, and it neither explains the image nor can be carried on. None is '
+        'given.')
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from nccs_pose.estimation.estimate import State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.text_files import write_text
 from nccs_pose.ros.interface import CAUSES, Endpoint, INPUTS, OUTPUTS, SERVICES, STATUSES, TF_MODES
@@ -68,6 +69,7 @@ def page() -> str:
         '## Transforms\n',
         _left([['`tf_mode`', 'somebody else broadcasts', 'this node broadcasts'], *TF_MODES]),
         TRANSFORMS, '## Diagnostics\n', _left([['status', 'values'], *STATUSES]),
+        _left([['state', 'when'], *([f'`{state.value}`', state.meaning] for state in State)]),
         _left([['cause of a refusal', 'what was refused'], *CAUSES]), '## Parameters\n', LIVE,
         '### Node\n', _options(NodeOptions), '### Estimator\n', _options(LocaliserOptions)]
     return '\n'.join(parts)
