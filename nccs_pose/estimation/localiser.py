@@ -159,6 +159,8 @@ class Localiser:
         self._open: tuple[Hypothesis, ...] = ()
         self._open_odometry: Pose2 | None = None
         self._doubts: frozenset[int] = frozenset()
+        # Lines that the poses since the last search rest on.
+        self._shown: frozenset[int] = frozenset()
 
     def set_prior(self, pose: Pose2, covariance: Array) -> None:
         """Give a hypothesis, as by hand or from the last run: it decides between equal poses.
@@ -233,7 +235,8 @@ class Localiser:
         if against is not None:
             return _Refused(against, alignment)
         here, claimed = self._searcher.score(alignment.pose, segments)
-        elsewhere = self._searcher.candidates(segments)
+        # No score exceeds 1.
+        elsewhere = self._searcher.candidates(segments) if here + _BETTER < 1.0 else ()
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):
@@ -382,6 +385,8 @@ class Localiser:
         self._prior = None
         self._open, self._open_odometry = (), None
         self._doubts = settled_doubts(self._doubts, alignment)
+        shown = frozenset(alignment.lines)
+        self._shown = shown if prior is None else self._shown | shown
         self._ever_tracked = True
         ranked = held or [found]
         quality = quality_of(
@@ -422,8 +427,11 @@ class Localiser:
             self._doubts |= {against.line}
         if refused.alignment is not None:
             doubted = Doubted(refused.alignment.pose, refused.alignment.points)
+        # A line beside its place that no pose has rested on speaks against all of them.
+        unheard = against is not None and against.line is not None and (
+            against.line not in self._shown)
         if track is not None and prediction is not None and prediction.by_odometry and not (
-                self._shaken(prediction, segments)):
+                unheard or self._shaken(prediction, segments)):
             age = (stamp_ns - track.stamp_ns) * 1e-9
             deviation = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
             if age <= self.options.coast_time and deviation <= self.options.coast_sigma:
