@@ -21,11 +21,9 @@ explains the image, best first.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-import math
-
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
@@ -35,19 +33,10 @@ from numpy.typing import NDArray
 # Strips that start hypotheses, and hypotheses that are looked at closely.
 _SEEDS = 6
 _CLOSE = 200
-# A map of many equal places gives no end of hypotheses: those of the heaviest strips are enough,
-# and above this number every fourth sample tells which are worth a closer look.
-_ENOUGH = 1500
+# Above this number every fourth sample tells which hypotheses are worth a closer look.
 _MANY = 400
 _COARSE = 4
 _REFINED = 24
-# Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
-_CROSSING = 0.12
-_ANGLE_GATE = 0.07
-# Strips may reach this much beyond a map line's ends, metres.
-_BEYOND = 0.2
-# Of a strip that starts a hypothesis this part may have nothing to do with its line.
-_JOINED = 0.2
 # Samples on each strip and on each map line.
 _SAMPLES = 12
 # Fewer samples than this on lines refine no pose.
@@ -59,26 +48,6 @@ _SAME_PLACE = 0.25
 _SAME_YAW = 0.15
 
 
-@dataclass(frozen=True, eq=False)
-class _FloorLines:
-    """The map's floor lines of one image's colours, as 2-D lines n . p = c."""
-
-    start: Array
-    direction: Array
-    normal: Array
-    offset: Array
-    length: Array
-    colour: tuple[str, ...]
-
-    @classmethod
-    def of(cls, line_map: LineMap) -> _FloorLines:
-        start, direction = line_map.starts[:, :2], line_map.directions[:, :2]
-        normal = np.column_stack([-direction[:, 1], direction[:, 0]])
-        return cls(
-            start, direction, normal, np.einsum('li,li->l', normal, start), line_map.lengths,
-            tuple(line.colour for line in line_map))
-
-
 def global_candidates(
     segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable, most: int = 8,
 ) -> tuple[Candidate, ...]:
@@ -87,8 +56,8 @@ def global_candidates(
     A candidate's score is the harmonic mean of two fractions: of the strips' pixels that lie on
     map lines, and of the map lines in view that strips lie on.
     """
-    lines = _FloorLines.of(line_map)
-    poses = _hypotheses(segments[:_SEEDS], lines)
+    lines = FloorLines.of(line_map)
+    poses = poses_of_pairs(segments[:_SEEDS], lines)
     if len(poses) == 0:
         return ()
     scorer = _Scorer(segments, lines, table)
@@ -112,7 +81,7 @@ def score_pose(
     """
     if not segments:
         return 0.0, 0.0
-    scorer = _Scorer(segments, _FloorLines.of(line_map), table)
+    scorer = _Scorer(segments, FloorLines.of(line_map), table)
     at = pose.as_array()[None]
     return float(scorer.score(at)[0]), float(scorer.claimed(at)[0])
 
@@ -147,83 +116,11 @@ def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
     return tuple(found)
 
 
-def _hypotheses(segments: tuple[FloorSegment, ...], lines: _FloorLines) -> Array:
-    """Poses (H, 3) that lay a pair of strips on a pair of map lines."""
-    if len(segments) < 2:
-        return np.zeros((0, 3))
-    map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
-    angle = np.array([math.atan2(-s.normal[0], s.normal[1]) for s in segments])
-    alike = np.array([[s.colour == colour for colour in lines.colour] for s in segments])
-    first, second = np.triu_indices(len(segments), 1)
-    between = angle[first] - angle[second]
-    crossing = np.abs(np.sin(between)) >= math.sin(_CROSSING)
-    first, second, between = first[crossing], second[crossing], between[crossing]
-    off = np.subtract.outer(map_angle, map_angle) - between[:, None, None]
-    match = (np.abs(np.sin(off)) < math.sin(_ANGLE_GATE)) & ~np.eye(len(map_angle), dtype=bool)
-    match &= alike[first][:, :, None] & alike[second][:, None, :]
-    pair, a, b = np.nonzero(match)
-    first, second = first[pair], second[pair]
-    yaw = map_angle[a] - angle[first] + 0.25 * np.sin(2.0 * (
-        map_angle[b] - map_angle[a] + angle[first] - angle[second]))
-    strips = _Strips(np.array([s.start for s in segments]), np.array([s.end for s in segments]))
-    poses: list[Array] = []
-    for begin in range(0, len(pair), _ENOUGH // 2):
-        part = slice(begin, begin + _ENOUGH // 2)
-        for turn in (0.0, np.pi):
-            poses.append(_intersect(
-                yaw[part] + turn, strips[first[part]], strips[second[part]], a[part], b[part],
-                lines))
-        if sum(map(len, poses)) > _ENOUGH:
-            break
-    return np.concatenate(poses) if poses else np.zeros((0, 3))
-
-
-@dataclass(frozen=True, eq=False)
-class _Strips:
-    """Ends of strips in base_link, (S, 2) each."""
-
-    start: Array
-    end: Array
-
-    def __getitem__(self, index: NDArray[np.intp]) -> _Strips:
-        return _Strips(self.start[index], self.end[index])
-
-
-def _intersect(
-    yaw: Array, first: _Strips, second: _Strips, a: NDArray[np.intp], b: NDArray[np.intp],
-    lines: _FloorLines,
-) -> Array:
-    """Poses (K, 3) that put K strips' middles on lines a and b (K,), where the extents agree."""
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-
-    def turned(points: Array) -> Array:
-        return np.hstack([c * points[:, :1] - s * points[:, 1:],
-                          s * points[:, :1] + c * points[:, 1:]])
-
-    ends = [(turned(strip.start), turned(strip.end)) for strip in (first, second)]
-    n_a, n_b = lines.normal[a], lines.normal[b]
-    right_a, right_b = (
-        lines.offset[line] - 0.5 * np.einsum('ki,ki->k', lines.normal[line], start + end)
-        for line, (start, end) in zip((a, b), ends))
-    det = n_a[:, 0] * n_b[:, 1] - n_a[:, 1] * n_b[:, 0]
-    t = np.column_stack([n_b[:, 1] * right_a - n_a[:, 1] * right_b,
-                         n_a[:, 0] * right_b - n_b[:, 0] * right_a]) / det[:, None]
-    fits = np.ones(len(yaw), dtype=bool)
-    for (start, end), line in zip(ends, (a, b)):
-        origin, direction = t - lines.start[line], lines.direction[line]
-        one, other = (np.einsum('ki,ki->k', direction, at + origin) for at in (start, end))
-        outside = (np.maximum(-np.minimum(one, other), 0.0)
-                   + np.maximum(np.maximum(one, other) - lines.length[line], 0.0))
-        # Something in line with a tape may have been joined to it.
-        fits &= outside < _BEYOND + _JOINED * np.hypot(*(end - start).T)
-    return np.column_stack([t, yaw])[fits]
-
-
 class _Scorer:
     """How well poses explain the strips of one image."""
 
     def __init__(
-        self, segments: tuple[FloorSegment, ...], lines: _FloorLines, table: FloorTable,
+        self, segments: tuple[FloorSegment, ...], lines: FloorLines, table: FloorTable,
     ) -> None:
         self._lines = lines
         self._table = table
@@ -262,7 +159,7 @@ class _Scorer:
             across = lines.normal[k, 0] * x + lines.normal[k, 1] * y - lines.offset[k]
             along = (lines.direction[k, 0] * (x - lines.start[k, 0])
                      + lines.direction[k, 1] * (y - lines.start[k, 1]))
-            outside = ((along < -_BEYOND) | (along > lines.length[k] + _BEYOND)
+            outside = ((along < -BEYOND) | (along > lines.length[k] + BEYOND)
                        | self._foreign[k, step // 2::step])
             distance = np.where(outside, np.inf, np.abs(across))
             closer = distance < best
@@ -296,8 +193,8 @@ class _Scorer:
             offset = base - start
             reach = offset @ along
             across = np.abs(offset @ np.array([-along[1], along[0]]))
-            covered |= ((across < tolerance) & (reach > -_BEYOND)
-                        & (reach < np.linalg.norm(end - start) + _BEYOND))
+            covered |= ((across < tolerance) & (reach > -BEYOND)
+                        & (reach < np.linalg.norm(end - start) + BEYOND))
         return (weight * covered).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
 
     def score(self, poses: Array) -> Array:

@@ -22,8 +22,8 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
 
+from nccs_pose.estimation.floor_points import fit_line, FloorPoints, principal_lines, squares
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.segment import Segmentation
@@ -41,8 +41,6 @@ _LONGEST_GAP = 0.8
 _BESIDE = 0.15
 # So much beside a strip, of what lies in it, is no crossing tape any more.
 _MOST_BESIDE = 0.35
-# Pixels may lie so much further from a tape's midline than half its width, in footprints.
-_FOOTPRINT = 0.75
 # A blob is a single line when no more than this part of it lies beside; of one that is, every
 # so many-th pixel is enough.
 _MISFIT = 0.15
@@ -50,8 +48,6 @@ _THINNED = 4
 # Of a shorter one all pixels are taken; of one with fewer than so many pixels none.
 _SHORT = 60
 _LEAST_LINE = 3
-# Points looked at together.
-_BLOCK = 256
 # Of one that is not, lines are drawn through so many of its pixels and their neighbours within
 # this distance (m, and footprints), and through as many pairs of its pixels; all such blobs have
 # so many of these lines together, and so many pixels.
@@ -85,78 +81,6 @@ class FloorSegment:
     colour: str = 'green'
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """P floor points of line-coloured pixels, blob after blob.
-
-    :ivar floor: (P, 2), metres.
-    :ivar spread: the three elements of J J^T, J the point's derivative by the pixel (3, P).
-    :ivar precision: weight in a fit (P,): far pixels cover much floor and say little.
-    :ivar blob: of each (P,), ascending.
-    :ivar weight: how many pixels each stands for (P,).
-    """
-
-    floor: Array
-    spread: Array
-    precision: Array
-    blob: NDArray[np.intp]
-    weight: Array
-
-    @classmethod
-    def of(cls, segmentation: Segmentation, table: FloorTable, width: float) -> _Points:
-        floor, jacobian = table.floor(segmentation.pixels)
-        by_u, by_v = jacobian[:, :, 0], jacobian[:, :, 1]
-        spread = np.stack([
-            by_u[:, 0] ** 2 + by_v[:, 0] ** 2, by_u[:, 0] * by_u[:, 1] + by_v[:, 0] * by_v[:, 1],
-            by_u[:, 1] ** 2 + by_v[:, 1] ** 2])
-        precision = 1.0 / (spread[0] + spread[2] + 0.1 * width**2)
-        return cls(floor, spread, precision, segmentation.label, segmentation.weight)
-
-    def __getitem__(self, index: NDArray[np.intp] | slice) -> _Points:
-        return _Points(
-            self.floor[index], self.spread[:, index], self.precision[index], self.blob[index],
-            self.weight[index])
-
-    def footprint(self, normal: Array) -> Array:
-        """How far each pixel reaches along a normal (2,), or each along its own (P, 2) (P,)."""
-        x, y = normal[..., 0], normal[..., 1]
-        # |J^T n|^2 = n^T (J J^T) n.
-        form = np.array([x * x, 2.0 * x * y, y * y])
-        square = form @ self.spread if normal.ndim == 1 else (form * self.spread).sum(axis=0)
-        return np.sqrt(np.maximum(square, 0.0))
-
-    def beyond(self, normal: Array, distance: Array, width: float) -> Array:
-        """How far the points are from being a tape's (P,), metres; below 0 they may be.
-
-        :param normal: of the tape's midline (2,), or one for each point (P, 2).
-        :param distance: of each point from the midline (P,), of either sign.
-        """
-        return np.abs(distance) - _FOOTPRINT * self.footprint(normal) - _half(width)
-
-    def near(self, normals: Array, offsets: Array, width: float) -> NDArray[np.float32]:
-        """1 where a point may be one of a tape's along each of C lines (P, C), else 0."""
-        x, y = normals.T.astype(np.float32)
-        by_spread = np.float32(_FOOTPRINT**2) * np.stack([x * x, 2.0 * x * y, y * y])
-        by_floor = np.stack([x, y, -offsets.astype(np.float32)])
-        floor = np.column_stack([self.floor, np.ones(len(self.floor))]).astype(np.float32)
-        spread = self.spread.T.astype(np.float32)
-        near = np.empty((len(floor), len(normals)), np.float32)
-        # In blocks that stay in the processor's cache.
-        for first in range(0, len(floor), _BLOCK):
-            block = slice(first, first + _BLOCK)
-            distance = np.abs(floor[block] @ by_floor)
-            distance -= np.float32(_half(width))
-            np.maximum(distance, 0.0, out=distance)
-            np.square(distance, out=distance)
-            np.less_equal(distance, spread[block] @ by_spread, out=near[block], casting='unsafe')
-        return near
-
-
-def _half(width: float) -> float:
-    """How far from a tape's midline a point of its floor may be, metres."""
-    return 0.5 * width + 0.005
-
-
 def floor_segments(
     segmentation: Segmentation, table: FloorTable, width: float, colour: str, most: int = 16,
 ) -> tuple[FloorSegment, ...]:
@@ -168,7 +92,7 @@ def floor_segments(
     """
     if len(segmentation.pixels) == 0:
         return ()
-    points = _Points.of(segmentation, table, width)
+    points = FloorPoints.of(segmentation, table, width)
     normals, offsets, kept = _candidates(points, width)
     if len(normals) == 0:
         return ()
@@ -203,7 +127,7 @@ def floor_segments(
 
 
 def _candidates(
-    points: _Points, width: float,
+    points: FloorPoints, width: float,
 ) -> tuple[Array, Array, NDArray[np.intp]]:
     """Lines (C, 2), (C,) that may run through the blobs, and the points that are needed for them.
 
@@ -234,7 +158,7 @@ def _candidates(
 
 
 def _blob_lines(
-    points: _Points, first: NDArray[np.intp], number: NDArray[np.intp],
+    points: FloorPoints, first: NDArray[np.intp], number: NDArray[np.intp],
 ) -> tuple[Array, Array]:
     """Each blob's own line: normals (B, 2) and offsets (B,).
 
@@ -245,11 +169,11 @@ def _blob_lines(
     total = np.add.reduceat(weight, first)[:, None]
     mean = np.add.reduceat(weight[:, None] * points.floor, first) / total
     moved = points.floor - mean[number]
-    second = np.add.reduceat(weight[:, None] * _squares(moved), first)
-    return _principal(mean, second)
+    second = np.add.reduceat(weight[:, None] * squares(moved), first)
+    return principal_lines(mean, second)
 
 
-def _through_neighbours(part: _Points, seeds: int) -> tuple[Array, Array]:
+def _through_neighbours(part: FloorPoints, seeds: int) -> tuple[Array, Array]:
     """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
     seed = np.arange(0, len(part.floor), max(1, len(part.floor) // seeds))
     footprint = np.sqrt(0.5 * (part.spread[0, seed] + part.spread[2, seed]))
@@ -259,14 +183,14 @@ def _through_neighbours(part: _Points, seeds: int) -> tuple[Array, Array]:
     near = near[near.sum(axis=1) >= _LEAST_LINE]
     weight = near * part.precision
     moved = part.floor - part.floor.mean(axis=0)
-    sums = weight @ np.column_stack([np.ones(len(moved)), moved, _squares(moved)])
+    sums = weight @ np.column_stack([np.ones(len(moved)), moved, squares(moved)])
     mean = sums[:, 1:3] / sums[:, :1]
-    second = sums[:, 3:] - sums[:, :1] * _squares(mean)
-    return _principal(mean + part.floor.mean(axis=0), second)
+    second = sums[:, 3:] - sums[:, :1] * squares(mean)
+    return principal_lines(mean + part.floor.mean(axis=0), second)
 
 
 def _through_pairs(
-    part: _Points, rng: np.random.Generator, seeds: int,
+    part: FloorPoints, rng: np.random.Generator, seeds: int,
 ) -> tuple[Array, Array]:
     """Lines through random pairs of a blob's pixels."""
     pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2))]
@@ -277,41 +201,8 @@ def _through_pairs(
     return across, np.einsum('ni,ni->n', across, pair[:, 0])
 
 
-def _squares(points: Array) -> Array:
-    """xx, xy and yy of points (N, 2) as (N, 3)."""
-    x, y = points[:, 0], points[:, 1]
-    return np.column_stack([x * x, x * y, y * y])
-
-
-def _principal(mean: Array, second: Array) -> tuple[Array, Array]:
-    """Total least squares lines: unit normals (K, 2) and offsets (K,).
-
-    :param mean: centres of gravity (K, 2).
-    :param second: xx, xy and yy about them (K, 3).
-    """
-    # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
-    angle = 0.5 * np.arctan2(2.0 * second[:, 1], second[:, 0] - second[:, 2])
-    normal = np.column_stack([-np.sin(angle), np.cos(angle)])
-    return normal, np.einsum('ki,ki->k', normal, mean)
-
-
-def _fit(floor: Array, weight: Array) -> tuple[Array, float]:
-    """Total least squares line through points (M, 2): unit normal (2,) and offset.
-
-    One line in plain numbers: arrays of one are slow.
-    """
-    x, y = floor[:, 0], floor[:, 1]
-    total = weight.sum()
-    mean_x, mean_y = weight @ x / total, weight @ y / total
-    x, y = x - mean_x, y - mean_y
-    by_x = weight * x
-    angle = 0.5 * math.atan2(2.0 * (by_x @ y), by_x @ x - (weight * y) @ y)
-    normal = np.array([-math.sin(angle), math.cos(angle)])
-    return normal, float(normal[0] * mean_x + normal[1] * mean_y)
-
-
 def _strip(
-    points: _Points, free: NDArray[np.bool_], inside: NDArray[np.intp], width: float,
+    points: FloorPoints, free: NDArray[np.bool_], inside: NDArray[np.intp], width: float,
 ) -> tuple[Array, float, NDArray[np.intp], NDArray[np.intp]] | None:
     """Refine a strip on its own pixels.
 
@@ -320,7 +211,7 @@ def _strip(
         where too little is left.
     """
     for _ in range(2):
-        normal, offset = _fit(points.floor[inside], points.precision[inside])
+        normal, offset = fit_line(points.floor[inside], points.precision[inside])
         beyond = points.beyond(normal, points.floor @ normal - offset, width)
         direction = np.array([-normal[1], normal[0]])
         along = points.floor @ direction
@@ -338,7 +229,7 @@ def _strip(
 
 
 def _longest_run(
-    points: _Points, along: Array, inside: NDArray[np.intp],
+    points: FloorPoints, along: Array, inside: NDArray[np.intp],
 ) -> NDArray[np.intp]:
     """Of a strip's points those of its heaviest part without a long gap.
 
@@ -356,7 +247,7 @@ def _longest_run(
 
 
 def _segment(
-    points: _Points, pixels: Array, inside: NDArray[np.intp], normal: Array, offset: float,
+    points: FloorPoints, pixels: Array, inside: NDArray[np.intp], normal: Array, offset: float,
     colour: str,
 ) -> FloorSegment:
     direction = np.array([-normal[1], normal[0]])
