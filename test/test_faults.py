@@ -259,7 +259,7 @@ def test_a_fault_needs_a_drive_around_it(rehearsal):
 
 @pytest.fixture(scope='module')
 def arena_rehearsal() -> Rehearsal:
-    return rehearse(width=480, frames=18)
+    return rehearse(width=640, frames=18)
 
 
 @pytest.mark.parametrize('name', ['white', 'disordered', 'one_line', 'carried_2m', 'turned_180'])
@@ -269,6 +269,15 @@ def test_the_localiser_is_not_fooled_and_comes_back(name, arena_rehearsal):
     assert row.answered >= START
     assert row.recovered is not None
     assert row.recovered <= 3
+
+
+@pytest.mark.parametrize('seed', [4, 7])
+def test_a_line_moved_in_the_map_is_noticed_by_the_thin_one_opposite(seed):
+    # East is 0.2 m off and the only one that fixes the pose along x, but for the western one,
+    # which lies 0.4 px wide at the rim of the image, 2 px beside its place.
+    row = run_fault(BY_NAME['map_line_moved'], rehearse(640, 18, seed), Localiser)
+    assert row.wrong == 0
+    assert row.answered == 0
 
 
 def test_the_command_names_faults_and_refuses_what_it_does_not_know(capsys):

@@ -28,16 +28,26 @@ from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.profile_search import search_profiles
+from nccs_pose.vision.profile_search import contrast_across
 from nccs_pose.vision.profiles import fit_profiles
 import numpy as np
 from numpy.typing import NDArray
 
-# So many stations, and this part of all of a line's, have to agree on another place.
+# So many stations have to be in view.
 _LEAST_STATIONS = 10
-_LEAST_SHARE = 0.5
-# They agree within this, px.
-_AGREE = 1.0
+# A line is looked for up to this far beside its place, metres, in steps of this, px; turned by
+# this much more or less at its ends than in its middle, as parts of the shift's range.
+_NEAR = 0.4
+_STEP = 0.5
+_TURNS = (-0.5, -0.25, 0.0, 0.25, 0.5)
+# A tape shows contrast between these, as fractions of what tapes show here, and so much more than
+# there is at the predicted place.
+_CONTRAST = (0.25, 2.0)
+_BETTER = (0.15, 3.0)
+# Where it is off by less than this, px, its profiles say by how much.
+_CAPTURED = 1.0
+# What is thinner than this, px, is outshone by what surrounds it.
+_LEAST_WIDTH = 0.31
 # Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
 # more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
 _BESIDE = 0.5
@@ -45,8 +55,6 @@ _EVIDENT = 5.0
 _DISTURBED = 0.28
 # It is in its place when it is off by less than this for certain, px.
 _IN_PLACE = 0.5
-# What shows less or more contrast than this, as fractions of the tapes', is no tape.
-_CONTRAST = (0.35, 2.0)
 # What lies this near another line, metres beyond its footprint, is that line.
 _ON_ANOTHER = 0.05
 
@@ -76,20 +84,23 @@ def placement(
     """
     if len(bands) < _LEAST_STATIONS:
         return Placement()
-    fit, _ = fit_profiles(image, bands, colour)
-    if fit.found.sum() >= max(_LEAST_STATIONS, _LEAST_SHARE * len(bands)):
+    scale = bands.half_width / (0.5 * line_map[line].width)
+    shift = _strongest(image, bands, moved, colour, reach, scale)
+    if shift is None:
+        return Placement()
+    width = 2.0 * float(np.median(bands.half_width))
+    if float(np.mean(np.abs(shift))) <= _CAPTURED:
+        fit, _ = fit_profiles(image, bands, colour)
+        if fit.found.sum() < _LEAST_STATIONS:
+            return Placement()
         mean, deviation = _mean_shift((fit.shift - moved)[fit.found], fit.sigma[fit.found])
         off = abs(mean)
-        width = 2.0 * float(np.median(bands.half_width))
-        if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation):
+        if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
             return Placement(confirmed=off + 2.0 * deviation < _IN_PLACE)
-        shift, agree = np.full(len(bands), mean), fit.found
-    else:
-        shift, agree = _farther(image, bands, moved, colour, reach)
-    if not agree.any() or _on_another(
-            line, bands, shift + moved, agree, alignment, line_map, table):
+        shift = np.full(len(bands), mean)
+    if width < _LEAST_WIDTH or _on_another(line, bands, shift + moved, alignment, line_map, table):
         return Placement()
-    return Placement(beside=float(np.mean(np.abs(shift[agree]))))
+    return Placement(beside=float(np.mean(np.abs(shift))))
 
 
 def _mean_shift(shift: Array, sigma: Array) -> tuple[float, float]:
@@ -100,39 +111,59 @@ def _mean_shift(shift: Array, sigma: Array) -> tuple[float, float]:
     return mean, float(np.sqrt(max(1.0, spread) / weight.sum()))
 
 
-def _farther(
+def _mean_and_deviation(value: Array, weight: Array) -> tuple[float, float]:
+    """Weighted mean of values (N,) and its standard deviation, as they scatter."""
+    total = float(weight.sum())
+    mean = float(weight @ value) / total
+    return mean, float(np.sqrt(weight**2 @ (value - mean) ** 2)) / total
+
+
+def _strongest(
     image: NDArray[np.uint8], bands: Bands, moved: Array, colour: LineColour, reach: float,
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Shifts (N,) found anywhere in the band, and the stations that agree on one."""
-    fit = search_profiles(image, bands, colour, reach)
-    shift = fit.shift - moved
-    fits = fit.found & (fit.contrast > _CONTRAST[0]) & (fit.contrast < _CONTRAST[1])
-    along = np.linspace(-1.0, 1.0, len(bands))
-    found = np.flatnonzero(fits)
-    best = np.zeros(len(bands), dtype=bool)
-    least = max(_LEAST_STATIONS, _LEAST_SHARE * len(bands))
-    if len(found) < least:
-        return shift, best
-    # Straight beside its place, turned or not: the pair of stations that most others follow.
-    first, last = np.triu_indices(len(found), 1)
-    first, last = found[first], found[last]
-    apart = np.flatnonzero(along[last] - along[first] > 0.5)[::7]
-    for i, j in zip(first[apart], last[apart]):
-        slope = (shift[j] - shift[i]) / (along[j] - along[i])
-        follows = fits & (np.abs(shift - shift[i] - slope * (along - along[i])) <= _AGREE)
-        if follows.sum() > best.sum():
-            best = follows
-    if best.sum() < least or np.mean(np.abs(shift[best])) < _AGREE:
-        best = np.zeros(len(bands), dtype=bool)
-    return shift, best
+    scale: Array,
+) -> Array | None:
+    """Shifts (N,), px, at which a line as a whole is seen best; None where it is not seen.
+
+    A tape of half a pixel is lost in the noise of each of its stations, and plain in all of them
+    together: the contrast of the whole line is laid out over where it may lie on the floor.
+
+    :param scale: of the image across the line (N,), px per metre.
+    """
+    farthest = min(_NEAR, reach / float(np.median(scale)))
+    steps = int(np.ceil(farthest * float(np.median(scale)) / _STEP))
+    parallel = farthest / max(steps, 1) * np.arange(-steps, steps + 1.0)
+    turn = farthest * np.outer(_TURNS, np.linspace(-1.0, 1.0, len(bands)))
+    # (T, D, N), metres on the floor and then px across.
+    shift = (parallel[:, None] + turn[:, None, :]) * scale
+    places, contrast, power = contrast_across(image, bands, colour, reach + 1.0, _STEP)
+    at = np.clip((shift + moved - places[0]) / _STEP, 0.0, len(places) - 1.001)
+    low = at.astype(int)
+    station = np.arange(len(bands))
+    here = contrast[station, low]
+    here = here + (at - low) * (contrast[station, low + 1] - here)
+    within = np.abs(shift) <= reach
+    weight = np.where(within, power, 0.0)
+    total = weight.sum(axis=-1)
+    mean = (weight * here).sum(axis=-1) / np.maximum(total, 1e-9)
+    mean = np.where(total >= 0.5 * power.sum(), mean, -np.inf)
+    best = np.unravel_index(int(mean.argmax()), mean.shape)
+    offset = float(np.mean(np.abs(shift[best])))
+    level, noise = _mean_and_deviation(here[best], weight[best])
+    own = here[len(_TURNS) // 2, steps]
+    better, certain = _mean_and_deviation(here[best] - own, weight[best])
+    if not max(_CONTRAST[0], _EVIDENT * noise) < level < _CONTRAST[1]:
+        return None
+    if offset > _CAPTURED and better < max(_BETTER[0], _BETTER[1] * certain):
+        return None
+    return shift[best]
 
 
 def _on_another(
-    k: int, bands: Bands, shift: Array, agree: NDArray[np.bool_], alignment: Alignment,
-    line_map: LineMap, table: FloorTable,
+    k: int, bands: Bands, shift: Array, alignment: Alignment, line_map: LineMap,
+    table: FloorTable,
 ) -> bool:
     """Whether what is seen lies on another line of the map."""
-    floor, jacobian = table.floor((bands.midline + shift[:, None] * bands.across)[agree])
+    floor, jacobian = table.floor(bands.midline + shift[:, None] * bands.across)
     footprint = np.sqrt(np.einsum('pij,pij->p', jacobian, jacobian))
     at = alignment.pose.apply(floor)
     for other, line in enumerate(line_map):

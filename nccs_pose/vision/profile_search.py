@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import cv2
+from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.profiles import as_complex, FOUND, FOUND_FRACTION, ProfileFit
@@ -35,21 +36,7 @@ def search_profiles(
 
     For a prediction that is several pixels off; good to about a pixel.
     """
-    half = float(np.percentile(bands.half_width, 75)) if len(bands) else 1.0
-    kernel_half = int(np.ceil(half + 3.0))
-    side = int(np.ceil(reach)) + kernel_half
-    s = np.broadcast_to(
-        np.arange(-side, side + 1.0, dtype=np.float32), (len(bands), 2 * side + 1))
-    weights = colour.discriminant.astype(np.float32)
-    feature = _sample(image, bands, s) @ weights
-    k = np.arange(-kernel_half, kernel_half + 1.0)
-    wide = bands.half_width[:, None]
-    box = ndtr((k + wide) / colour.blur) - ndtr((k - wide) / colour.blur)
-    box -= box.mean(axis=1, keepdims=True)
-    power = np.maximum((box * box).sum(axis=1), 1e-9)
-    box = (box / power[:, None]).astype(np.float32)
-    windows = np.lib.stride_tricks.sliding_window_view(feature, len(k), axis=1)
-    contrast = (windows @ box[:, :, None])[..., 0]
+    offsets, contrast, _ = contrast_across(image, bands, colour, reach)
     # A tape goes on from station to station; a speck does not.
     pooled = cv2.blur(contrast, (1, 5)) if len(bands) > 5 else contrast
     best = pooled.argmax(axis=1)
@@ -58,8 +45,38 @@ def search_profiles(
     # From station to station the tape stays and the noise does not.
     noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
     return ProfileFit(
-        best - float(side - kernel_half), np.full(len(bands), 1.0), height.astype(float),
+        offsets[best], np.full(len(bands), 1.0), height.astype(float),
         height > max(FOUND * noise, FOUND_FRACTION))
+
+
+def contrast_across(
+    image: NDArray[np.uint8], bands: Bands, colour: LineColour, reach: float, step: float = 1.0,
+) -> tuple[Array, NDArray[np.float32], Array]:
+    """How much of a tape there is at every place across each band.
+
+    :param reach: how far to either side, px.
+    :param step: from one place to the next, px.
+    :returns: the places (K,), px; the contrast of the template there (N, K), 1 where it is a
+        tape's; and the template's energy (N,), which that contrast's certainty grows with.
+    """
+    half = float(np.percentile(bands.half_width, 75)) if len(bands) else 1.0
+    kernel_half = int(np.ceil((half + 3.0) / step))
+    places = int(np.ceil(reach / step))
+    side = places + kernel_half
+    s = np.broadcast_to(
+        np.arange(-side, side + 1.0, dtype=np.float32) * np.float32(step),
+        (len(bands), 2 * side + 1))
+    weights = colour.discriminant.astype(np.float32)
+    feature = _sample(image, bands, s) @ weights
+    k = np.arange(-kernel_half, kernel_half + 1.0) * step
+    wide = bands.half_width[:, None]
+    box = ndtr((k + wide) / colour.blur) - ndtr((k - wide) / colour.blur)
+    box -= box.mean(axis=1, keepdims=True)
+    power = np.maximum((box * box).sum(axis=1), 1e-9)
+    box = (box / power[:, None]).astype(np.float32)
+    windows = np.lib.stride_tricks.sliding_window_view(feature, len(k), axis=1)
+    contrast = (windows @ box[:, :, None])[..., 0]
+    return np.arange(-places, places + 1.0) * step, contrast, power
 
 
 def _sample(
