@@ -18,7 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.floor_table import (
+    as_complex,
+    as_points,
+    Complex,
+    FloorExpansion,
+    FloorTable,
+)
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import Bands
@@ -114,58 +120,56 @@ class BandPredictor:
         direction = (self._direction @ rotation)[number]
         middle = ((self._start - position) @ rotation)[number] + distance[:, None] * direction
         image = self._table.expand(middle)
-        left = np.empty_like(direction)
-        left[:, 0] = -direction[:, 1]
-        left[:, 1] = direction[:, 0]
-        ahead_of, left_of = image.polar(direction), image.polar(left)
+        # Vectors of the plane are complex numbers from here on: a quarter turn is a factor i,
+        # and the product with a conjugate holds the dot product in its real part.
+        ahead_of = image.polar(as_complex(direction))
+        left_of = 1j * ahead_of
         ahead, aside = image.slope(ahead_of), image.slope(left_of)
         # The cut across the tape whose image is normal to the curve leans along the line.
-        speed2 = np.maximum(np.einsum('ni,ni->n', ahead, ahead), 1e-9)
-        lean = -np.einsum('ni,ni->n', aside, ahead) / speed2
+        speed2 = np.maximum(_dot(ahead, ahead), 1e-9)
+        lean = -_dot(aside, ahead) / speed2
         half = 0.5 * self._width[number]
-        cut_of = half[:, None] * (left_of + lean[:, None] * ahead_of)
-        across = half[:, None] * (aside + lean[:, None] * ahead)
-        half_width = np.maximum(np.sqrt(np.einsum('ni,ni->n', across, across)), 1e-12)
-        across /= half_width[:, None]
-        along = np.empty_like(across)
-        along[:, 0] = across[:, 1]
-        along[:, 1] = -across[:, 0]
-        bend = np.einsum('ni,ni->n', image.curvature(ahead_of), across) / speed2
+        across = half * (aside + lean * ahead)
+        half_width = np.maximum(np.abs(across), 1e-12)
+        across /= half_width
+        bend = _dot(image.curvature(ahead_of), across) / speed2
         # The two edges lie unequally far from the midline: a matter of the second order.
-        centre = image.pixels + 0.5 * image.curvature(cut_of)
+        centre = as_points(image.pixels + 0.5 * image.curvature(
+            half * (left_of + lean * ahead_of)))
         # Near its ends the leaning cut would leave the tape.
         reach = half * np.abs(lean)
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
                 & (distance < self._length[number] - reach))
-        bands = Bands(centre, image.pixels, across, along, bend, half_width, places.spacing,
+        bands = Bands(centre, as_points(image.pixels), as_points(across),
+                      as_points(-1j * across), bend, half_width, places.spacing,
                       self._lines[number])
-        slide = self._slide(rotation, middle, image.offset, across, np.stack(
-            [np.einsum('ni,ni->n', image.first[:, k], across) for k in (0, 1)], axis=1),
-            image.outward)
+        slide = self._slide(rotation, middle, image, across)
         if keep.all():
             return bands, slide
         return bands[keep], slide[keep]
 
     def _slide(
-        self, rotation: Array, point: Array, offset: Array, across: Array, by_polar: Array,
-        outward: Array,
+        self, rotation: Array, point: Array, image: FloorExpansion, across: Complex,
     ) -> Array:
         """Derivative of the stations' place across by pose and attitude (N, 6).
 
         :param point: on the floor, in base_link (N, 2).
-        :param offset: from the mirror's foot (N, 2).
-        :param by_polar: derivative of the place across, outward and round (N, 2), px per metre.
+        :param image: of the points.
+        :param across: unit normals of the curves (N,).
         """
-        out, turned = by_polar[:, 0], by_polar[:, 1]
-        gradient = np.empty_like(across)
-        gradient[:, 0] = out * outward[:, 0] - turned * outward[:, 1]
-        gradient[:, 1] = out * outward[:, 1] + turned * outward[:, 0]
+        gradient = as_points(image.outward * (
+            _dot(image.first[0], across) + 1j * _dot(image.first[1], across)))
         slide = np.empty((len(point), 6))
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw.
         slide[:, :2] = -gradient @ rotation.T
         slide[:, 2] = gradient[:, 0] * point[:, 1] - gradient[:, 1] * point[:, 0]
         # Floor that sinks by dz is seen where the ray would have met it.
-        slide[:, 3] = -np.einsum('ni,ni->n', gradient, self._table.falls(offset))
+        slide[:, 3] = -np.einsum('ni,ni->n', gradient, self._table.falls(image.offset))
         slide[:, 4] = slide[:, 3] * point[:, 1]
         slide[:, 5] = -slide[:, 3] * point[:, 0]
         return slide
+
+
+def _dot(a: Complex, b: Complex) -> Array:
+    """Dot products (N,) of vectors as complex numbers (N,)."""
+    return a.real * b.real + a.imag * b.imag

@@ -49,6 +49,9 @@ _BASES = np.hstack([
     np.vstack([2.0 * _BASIS[2], 6.0 * _BASIS[3], np.zeros((2, 4))])])
 
 
+Complex = NDArray[np.complex128]
+
+
 def _basis(t: Array) -> Array:
     """Weights of the four coefficients for the value and two derivatives (N, 3, 4)."""
     powers = np.empty((len(t), 4))
@@ -59,42 +62,49 @@ def _basis(t: Array) -> Array:
     return (powers @ _BASES).reshape(-1, 3, 4)
 
 
+def as_complex(vectors: Array) -> Complex:
+    """Vectors (N, 2) of a plane as complex numbers x + iy (N,)."""
+    return np.ascontiguousarray(vectors).view(np.complex128)[:, 0]
+
+
+def as_points(numbers: Complex) -> Array:
+    """Complex numbers (N,) as vectors (N, 2) again."""
+    return np.ascontiguousarray(numbers).view(np.float64).reshape(-1, 2)
+
+
 @dataclass(frozen=True, eq=False)
 class FloorExpansion:
     """Pixels of N ground points to second order in the points.
 
-    Derivatives are kept in each point's own polar basis, away from the mirror's foot and round it.
+    Pixels u + iv and directions of the floor x + iy are complex numbers. Derivatives are kept in
+    each point's own polar basis, away from the mirror's foot and round it.
 
-    :ivar pixels: (N, 2).
+    :ivar pixels: (N,).
     :ivar offset: of the points from the mirror's foot (N, 2), metres.
-    :ivar outward: unit vector away from the mirror's foot (N, 2), in base_link.
-    :ivar first: d(u, v) outward and round (N, 2, 2), px per metre, the direction first.
-    :ivar second: outward twice, mixed, and round twice (N, 3, 2), px per square metre.
+    :ivar outward: unit vector away from the mirror's foot (N,), in base_link.
+    :ivar first: derivative of the pixels outward and round (2, N), px per metre.
+    :ivar second: outward twice, mixed, and round twice (3, N), px per square metre.
     """
 
-    pixels: Array
+    pixels: Complex
     offset: Array
-    outward: Array
-    first: Array
-    second: Array
+    outward: Complex
+    first: Complex
+    second: Complex
 
-    def polar(self, direction: Array) -> Array:
-        """Components (N, 2), outward and round, of directions (N, 2) of base_link."""
-        x, y = self.outward[:, 0], self.outward[:, 1]
-        turned = np.empty((len(x), 2))
-        turned[:, 0] = x * direction[:, 0] + y * direction[:, 1]
-        turned[:, 1] = x * direction[:, 1] - y * direction[:, 0]
-        return turned
+    def polar(self, direction: Complex) -> Complex:
+        """Components, outward + i round, of directions of base_link (N,)."""
+        return direction * self.outward.conj()
 
-    def slope(self, polar: Array) -> Array:
-        """First derivative (N, 2) of the pixels along directions in the polar basis (N, 2)."""
-        return polar[:, :1] * self.first[:, 0] + polar[:, 1:] * self.first[:, 1]
+    def slope(self, polar: Complex) -> Complex:
+        """First derivative of the pixels along directions in the polar basis (N,)."""
+        return polar.real * self.first[0] + polar.imag * self.first[1]
 
-    def curvature(self, polar: Array) -> Array:
-        """Second derivative (N, 2) of the pixels along directions in the polar basis (N, 2)."""
-        out, turned = polar[:, :1], polar[:, 1:]
-        return (out * out * self.second[:, 0] + 2.0 * out * turned * self.second[:, 1]
-                + turned * turned * self.second[:, 2])
+    def curvature(self, polar: Complex) -> Complex:
+        """Second derivative of the pixels along directions in the polar basis (N,)."""
+        out, turned = polar.real, polar.imag
+        return (out * out * self.second[0] + 2.0 * out * turned * self.second[1]
+                + turned * turned * self.second[2])
 
 
 class FloorTable:
@@ -214,24 +224,21 @@ class FloorTable:
         n = len(points)
         around = self._knots.take((row * self._columns + column)[:, None] + self._taps, axis=0)
         by_a = (_basis(a - row) @ around.reshape(n, 4, 8)).reshape(n, 3, 4, 2)
-        partial = (_basis(b - column) @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)).reshape(
-            n, 3, 3, 2)
-        # partial[:, j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
-        p_a, p_b = partial[:, 0, 1] / step_a, partial[:, 1, 0] / step_b
+        partial = _basis(b - column) @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)
+        # partial[j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
+        partial = np.ascontiguousarray(
+            partial.view(np.complex128).reshape(n, 9).T).reshape(3, 3, n)
+        p_a, p_b = partial[0, 1] / step_a, partial[1, 0] / step_b
         reach = square + self.height**2
-        by_radius = (self.height / reach)[:, None]
-        inverse = (1.0 / radius)[:, None]
-        first = np.empty((n, 2, 2))
-        first[:, 0] = p_a * by_radius
-        first[:, 1] = p_b * inverse
-        second = np.empty((n, 3, 2))
-        second[:, 0] = (by_radius**2 / step_a**2) * partial[:, 0, 2] - (
-            2.0 * by_radius * (radius / reach)[:, None]) * p_a
-        second[:, 1] = (inverse * by_radius / (step_a * step_b)) * partial[:, 1, 1] - (
-            inverse * first[:, 1])
-        second[:, 2] = (inverse / step_b) ** 2 * partial[:, 2, 0] + inverse * first[:, 0]
+        by_radius, inverse = self.height / reach, 1.0 / radius
+        first = np.stack([p_a * by_radius, p_b * inverse])
+        second = np.empty((3, n), np.complex128)
+        second[0] = np.square(by_radius / step_a) * partial[0, 2] - (
+            2.0 * by_radius * radius / reach) * p_a
+        second[1] = (inverse * by_radius / (step_a * step_b)) * partial[1, 1] - inverse * first[1]
+        second[2] = np.square(inverse / step_b) * partial[2, 0] + inverse * first[0]
         return FloorExpansion(
-            partial[:, 0, 0], offset, offset * inverse, first, second)
+            partial[0, 0], offset, as_complex(offset) * inverse, first, second)
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
