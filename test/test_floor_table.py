@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
 from nccs_pose.geometry.pose import RigidTransform
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.scene import arena_rig
@@ -78,12 +78,14 @@ def test_derivatives_of_pixels_are_those_of_the_exact_projection(
     seen = a & b & c
     assert seen.sum() > 100
     found = table.expand(points)
-    polar = found.polar(direction)
-    np.testing.assert_allclose(found.pixels[seen], table.pixels(points)[seen], atol=1e-9)
+    polar = found.polar(as_complex(direction))
+    np.testing.assert_allclose(
+        as_points(found.pixels)[seen], table.pixels(points)[seen], atol=1e-9)
     slope, bend = (ahead - behind) / (2.0 * h), (ahead + behind - 2.0 * here) / h**2
-    assert np.abs(found.slope(polar) - slope)[seen].max() < 2e-3 * np.abs(slope[seen]).max()
+    assert np.abs(as_points(found.slope(polar)) - slope)[seen].max() < 2e-3 * np.abs(
+        slope[seen]).max()
     # The curve's bend counts over some pixels along it only.
-    assert np.median(np.abs(found.curvature(polar) - bend)[seen]) < 0.01 * np.abs(
+    assert np.median(np.abs(as_points(found.curvature(polar)) - bend)[seen]) < 0.01 * np.abs(
         bend[seen]).max()
 
 
