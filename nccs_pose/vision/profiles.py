@@ -102,15 +102,15 @@ def _read_pixels(
     at = (on_curve + centre[:, None])[:, :, None] + arm[:, None, :]
     pixels = at.view(np.float32)
     np.rint(pixels, out=pixels)
-    values = cv2.remap(image, pixels.reshape(-1, k, 2), None, cv2.INTER_NEAREST,
-                       borderMode=cv2.BORDER_REPLICATE)
     n = len(bands)
+    values = cv2.remap(image, pixels.reshape(n, m * k, 2), None, cv2.INTER_NEAREST,
+                       borderMode=cv2.BORDER_REPLICATE)
     at = at.reshape(n, m * k)
     at -= centre[:, None]
     at *= across.conj()
     s = np.square(at.imag)
     s *= bend
-    return values.reshape(n, m * k, 3), np.subtract(at.real, s, out=s)
+    return values, np.subtract(at.real, s, out=s)
 
 
 def as_complex(points: Array) -> NDArray[np.complex64]:
