@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 # A robot that has moved further than this, metres and rad, cannot see the very same image.
 _MOVED = 0.005
 # Rows this far apart tell a frozen camera from one that stands still in its own noise.
-_ROWS = 16
+_ROWS = 32
 
 
 class Admission:

@@ -153,11 +153,13 @@ def _products(
     rows[:, 2] = s
     np.subtract(edges[1], edges[0], out=rows[:, 3])
     # Numbers about zero keep their digits in sums of squares.
-    np.subtract(pixels.transpose(0, 2, 1), floor.astype(np.float32)[:, None], out=rows[:, 4:7])
+    for k, channel in enumerate(cv2.split(pixels)):
+        np.subtract(channel, np.float32(floor[k]), out=rows[:, 4 + k])
     rows[:, 7] = 1.0
-    products = (rows @ rows.transpose(0, 2, 1)).astype(float)
-    sums = products[:, 7, :7]
-    products = products[:, :7, :7] - sums[:, :, None] * (sums / count)[:, None, :]
+    # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
+    products = (rows[:, :7] @ rows.transpose(0, 2, 1)).astype(float)
+    sums = products[:, :, 7]
+    products = products[:, :, :7] - sums[:, :, None] * (sums / count)[:, None, :]
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0])
     products *= scale[:, None] * scale
