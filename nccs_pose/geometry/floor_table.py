@@ -274,14 +274,17 @@ class FloorTable:
 
         Bilinear in the coarse grid: good to about a tenth of a pixel's footprint.
         """
-        at = np.clip(pixels / _STRIDE, 0.0, None)
-        column = np.minimum(at[:, 0].astype(int), self._grid.shape[1] - 2)
-        row = np.minimum(at[:, 1].astype(int), self._grid.shape[0] - 2)
+        at = np.maximum(pixels / _STRIDE, 0.0)
+        rows, columns = self._grid.shape[:2]
+        column = np.minimum(at[:, 0].astype(int), columns - 2)
+        row = np.minimum(at[:, 1].astype(int), rows - 2)
         a = (at[:, 0] - column)[:, None]
         b = (at[:, 1] - row)[:, None]
-        p00, p10 = self._grid[row, column], self._grid[row, column + 1]
-        p01, p11 = self._grid[row + 1, column], self._grid[row + 1, column + 1]
-        points = (1 - b) * ((1 - a) * p00 + a * p10) + b * ((1 - a) * p01 + a * p11)
-        by_u = ((1 - b) * (p10 - p00) + b * (p11 - p01)) / _STRIDE
-        by_v = ((1 - a) * (p01 - p00) + a * (p11 - p10)) / _STRIDE
-        return points, np.stack([by_u, by_v], axis=2)
+        corner, grid = row * columns + column, self._grid.reshape(-1, 2)
+        p00, p10, p01, p11 = (
+            grid.take(corner + step, axis=0) for step in (0, 1, columns, columns + 1))
+        # By u along both edges of the cell, and from one to the other.
+        low, high = p10 - p00, p11 - p01
+        start, rise = p00 + a * low, p01 - p00 + a * (high - low)
+        by_u = (low + b * (high - low)) / _STRIDE
+        return start + b * rise, np.stack([by_u, rise / _STRIDE], axis=2)
