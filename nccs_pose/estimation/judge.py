@@ -147,6 +147,11 @@ def _fit(alignment: Alignment) -> float:
     return 1.0 / (1.0 + float(np.mean(sigma**2)) / _HALF_AS_GOOD**2)
 
 
+def lines_shown(alignment: Alignment) -> frozenset[int]:
+    """The lines that a pose shows in their places, most of each."""
+    return frozenset(np.flatnonzero(alignment.support >= _WEAK).tolist())
+
+
 def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:
     """The doubts that are left after a pose that holds: of lines that it does not show.
 

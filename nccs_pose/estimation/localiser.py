@@ -44,7 +44,7 @@ from nccs_pose.estimation.hypotheses import (
     Hypothesis,
     LEAST_IMAGES,
 )
-from nccs_pose.estimation.judge import Found, Judge, OPEN, settled_doubts
+from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
@@ -385,7 +385,7 @@ class Localiser:
         self._prior = None
         self._open, self._open_odometry = (), None
         self._doubts = settled_doubts(self._doubts, alignment)
-        shown = frozenset(alignment.lines)
+        shown = lines_shown(alignment)
         self._shown = shown if prior is None else self._shown | shown
         self._ever_tracked = True
         ranked = held or [found]
@@ -423,15 +423,16 @@ class Localiser:
         """Coast on odometry where that still says something; else say what is missing."""
         against, doubted, track = refused.objection, None, self._track
         missing = against.words if against is not None else _what_is_missing(segments)
+        # A line beside its place for the second time, or one that no pose has rested on, speaks
+        # against the poses before as well.
+        contradicted = False
         if against is not None and against.line is not None:
+            contradicted = against.line in self._doubts or against.line not in self._shown
             self._doubts |= {against.line}
         if refused.alignment is not None:
             doubted = Doubted(refused.alignment.pose, refused.alignment.points)
-        # A line beside its place that no pose has rested on speaks against all of them.
-        unheard = against is not None and against.line is not None and (
-            against.line not in self._shown)
         if track is not None and prediction is not None and prediction.by_odometry and not (
-                unheard or self._shaken(prediction, segments)):
+                contradicted or self._shaken(prediction, segments)):
             age = (stamp_ns - track.stamp_ns) * 1e-9
             deviation = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
             if age <= self.options.coast_time and deviation <= self.options.coast_sigma:
