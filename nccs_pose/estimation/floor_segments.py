@@ -105,14 +105,21 @@ def floor_segments(
     support = (points.weight.astype(np.float32) @ near).astype(float)
     free = np.ones(len(points.floor), dtype=bool)
     segments: list[FloorSegment] = []
+    futile: set[bytes] = set()
     while len(segments) < most:
         best = int(support.argmax())
         if support[best] < _LEAST_PIXELS:
             break
         support[best] = -np.inf
-        found = _strip(points, free, np.flatnonzero((near[:, best] > 0.0) & free), width)
-        if found is None:
+        start = np.flatnonzero((near[:, best] > 0.0) & free)
+        # Many lines through one small thing start from the very same points.
+        if start.tobytes() in futile:
             continue
+        found = _strip(points, free, start, width)
+        if found is None:
+            futile.add(start.tobytes())
+            continue
+        futile.clear()
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
             segments.append(_segment(points, pixels, inside, normal, offset, colour))
