@@ -107,8 +107,7 @@ class Judge:
                     f'line {name} is seen {seen.beside:.1f} px beside its place', line=k)
             others = lines_used(alignment) - (alignment.support[k] >= _WEAK)
             if k in doubts and not seen.confirmed and others < _BEYOND_DOUBT:
-                return Objection(
-                    f'line {name} was seen beside its place, and not in it since', line=k)
+                return Objection(f'line {name} was seen beside its place, and not in it since')
         return None
 
     def found(

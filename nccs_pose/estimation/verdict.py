@@ -45,7 +45,8 @@ class Objection:
     """Why a pose is not to be believed.
 
     :ivar words: the reason.
-    :ivar line: the map line that speaks against it, by its index; None where none does.
+    :ivar line: the map line that is seen beside its place in this image, by its index; None where
+        none is for certain: what lies near a line's place may be another thing.
     :ivar hidden: whether the pose may still be right, if something hides what should be seen.
     """
 
@@ -152,8 +153,7 @@ def contradiction(
             offset = _beside(strip, alignment.pose, line_map[k])
             if offset is not None:
                 return Objection(
-                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map',
-                    line=k)
+                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map')
     return None
 
 
