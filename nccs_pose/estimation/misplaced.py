@@ -46,6 +46,9 @@ _CONTRAST = (0.25, 2.0)
 _BETTER = (0.15, 3.0)
 # Where it is off by less than this, px, its profiles say by how much.
 _CAPTURED = 1.0
+# A tape this wide, px, of which this part is found in its place is there.
+_PLAIN_WIDTH = 1.0
+_PLAIN_SHARE = 0.8
 # What is thinner than this, px, is outshone by what surrounds it.
 _LEAST_WIDTH = 0.31
 # Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
@@ -84,19 +87,25 @@ def placement(
     """
     if len(bands) < _LEAST_STATIONS:
         return Placement()
+    width = 2.0 * float(np.median(bands.half_width))
+    fit, _ = fit_profiles(image, bands, colour)
+    found = int(fit.found.sum())
+    mean, deviation = _mean_shift(
+        (fit.shift - moved)[fit.found], fit.sigma[fit.found]) if found else (0.0, np.inf)
+    off = abs(mean)
+    confirmed = off + 2.0 * deviation < _IN_PLACE
+    # No need to look for what is plainly there.
+    if confirmed and width >= _PLAIN_WIDTH and found >= _PLAIN_SHARE * len(bands):
+        return Placement(confirmed=True)
     scale = bands.half_width / (0.5 * line_map[line].width)
     shift = _strongest(image, bands, moved, colour, reach, scale)
     if shift is None:
         return Placement()
-    width = 2.0 * float(np.median(bands.half_width))
     if float(np.mean(np.abs(shift))) <= _CAPTURED:
-        fit, _ = fit_profiles(image, bands, colour)
-        if fit.found.sum() < _LEAST_STATIONS:
+        if found < _LEAST_STATIONS:
             return Placement()
-        mean, deviation = _mean_shift((fit.shift - moved)[fit.found], fit.sigma[fit.found])
-        off = abs(mean)
         if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
-            return Placement(confirmed=off + 2.0 * deviation < _IN_PLACE)
+            return Placement(confirmed=confirmed)
         shift = np.full(len(bands), mean)
     if width < _LEAST_WIDTH or _on_another(line, bands, shift + moved, alignment, line_map, table):
         return Placement()
