@@ -144,13 +144,17 @@ class Aligner:
         places = self._predictor.places(pose, _SPACING, self._options.stations)
         if len(places) < _LEAST_STATIONS:
             return None
+        attitude = np.zeros(3)
         sharp = min(colour.blur for colour in colours) < ROUGH_BLUR
         if sharp and len(places) >= _ROUGH * _LEAST_STATIONS:
-            rough = self._measure(image, places.every(_ROUGH), pose, prior, colours, rough=True)
-            pose = pose if rough is None else rough.refinement.pose
+            rough = self._measure(
+                image, places.every(_ROUGH), pose, prior, colours, attitude, rough=True)
+            if rough is not None:
+                pose, attitude = rough.refinement.pose, rough.refinement.attitude
         result: Alignment | None = None
         for _ in range(_ITERATIONS):
-            measured = self._measure(image, places, pose, prior, colours, rough=False)
+            measured = self._measure(
+                image, places, pose, prior, colours, attitude, rough=False)
             if measured is None:
                 return None
             known, colours = colours, measured.colours
@@ -164,7 +168,7 @@ class Aligner:
             settled = learned < _LEARNED_BLUR and (
                 measured.moved < _SETTLED_BLURS * sharpest or close(
                     result.pose, pose, result.covariance, _SETTLED))
-            pose = result.pose
+            pose, attitude = result.pose, result.refinement.attitude
             if settled:
                 return result
             if measured.moved > _MOVED_PX:
@@ -224,21 +228,30 @@ class Aligner:
 
     def _measure(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
-        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], *, rough: bool,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], attitude: Array, *,
+        rough: bool,
     ) -> _Measured | None:
-        """Measure stations where a pose predicts them, and solve; None with too few of them."""
+        """Measure stations where a pose predicts them, and solve; None with too few of them.
+
+        :param attitude: the base's (z, roll, pitch) off its plane as known so far (3,): what is
+            measured from there is small, and a profile is true to small shifts only.
+        """
         bands, slide = self._predictor.bands(places, start)
         if len(bands) < _LEAST_STATIONS:
             return None
+        known = slide[:, 3:] @ attitude
+        bands = bands.shifted(known)
         fit, colours = self._fit(image, bands, colours, rough)
         used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
         if used.sum() < _LEAST_STATIONS:
             return None
         refinement = self._solved(
-            fit.shift[used], fit.sigma[used], slide[used], bands.across[used], start, prior)
+            (known + fit.shift)[used], fit.sigma[used], slide[used], bands.across[used], start,
+            prior)
         step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
-                         float(wrap_angle(refinement.pose.yaw - start.yaw))])
-        moved = float(np.abs(slide[:, :3] @ step).max())
+                         float(wrap_angle(refinement.pose.yaw - start.yaw)),
+                         *(refinement.attitude - attitude)])
+        moved = float(np.abs(slide @ step).max())
         return _Measured(refinement, bands, fit, used, moved, colours)
 
 

@@ -60,6 +60,9 @@ _SHARP_PX = 0.3
 FOUND = 6.0
 # A line this much fainter than its colour's contrast, or a station than its line, is not.
 FOUND_FRACTION = 0.35
+# A line that shows less of the tapes' contrast than this is clutter; less is asked of one thinner
+# than a pixel, in proportion to its width.
+_FAINT = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +190,7 @@ def fit_profiles(
         colour = colour.learn(system.height, system.power, system.left / (count - 4), floor)
     fit = _shifts(bands.label, system, colour.discriminant, count, np.maximum(
         # Where the grid is finer than the pixels, each of them is counted several times.
-        count / (bands.spacing * 2.0 * (bands.half_width + margin)), 1.0))
+        count / (bands.spacing * 2.0 * (bands.half_width + margin)), 1.0), 2.0 * bands.half_width)
     # A template beside its tape would take the misfit for blur.
     if not rough and float(np.median(np.abs(fit.shift))) < _SHARP_PX:
         share = products[:, 3, 0] / system.power
@@ -243,6 +246,7 @@ def _eliminated(products: Array) -> _System:
 
 def _shifts(
     label: NDArray[np.intp], system: _System, weights: Array, count: int, repeats: Array,
+    width: Array,
 ) -> ProfileFit:
     """Shifts and their noise along a colour's discriminant.
 
@@ -264,7 +268,7 @@ def _shifts(
     moved = (system.own @ weights - share * slope) / shift_power
     a = system.height @ weights - system.by_shift * moved
     told = power / variance
-    level, certain = _levels(label, a, power, told)
+    level, certain = _levels(label, a, power, told, width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One station's contrast is noisy where the tape is thin; its neighbours know better.
     prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
@@ -274,11 +278,12 @@ def _shifts(
 
 
 def _levels(
-    label: NDArray[np.intp], a: Array, weight: Array, told: Array,
+    label: NDArray[np.intp], a: Array, weight: Array, told: Array, width: Array,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Each station's expected contrast, its line's weighted median, and whether that is sure.
 
     :param label: line (N,), ascending.
+    :param width: of the tape (N,), px.
     """
     order = np.lexsort((a, label))
     edge = np.flatnonzero(np.diff(label)) + 1
@@ -290,5 +295,6 @@ def _levels(
     middle = np.searchsorted(total, 0.5 * (bounds[1:] + bounds[:-1]))
     level = a[order[np.minimum(middle, len(order) - 1)]]
     # Far stations are faint one by one, but a whole line of them is not.
-    certain = (level * np.sqrt(np.bincount(number, told)) > FOUND) & (level > 0.1)
+    certain = (level * np.sqrt(np.bincount(number, told)) > FOUND) & (
+        level > _FAINT * np.minimum(1.0, np.bincount(number, width) / np.bincount(number)))
     return np.where(certain, level, 1e-9)[number], certain[number]
