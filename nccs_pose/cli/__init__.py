@@ -39,7 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = find_command(argv)
     name = f'nccs-pose {command.name}' if command else 'nccs-pose'
     try:
-        return parse(argv).run()
+        code = parse(argv).run()
+        # What is still buffered meets a closed pipe here, not while Python ends.
+        sys.stdout.flush()
+        return code
     except SystemExit as stop:  # argparse, after it has printed help or usage
         return stop.code if isinstance(stop.code, int) else 2
     except NccsPoseError as error:
