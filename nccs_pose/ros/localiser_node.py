@@ -20,6 +20,7 @@ parts are wired to the lifecycle.
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from typing import Any
@@ -305,4 +306,7 @@ def make_node() -> LocaliserNode:
     """Create the node and start it, if it is to start by itself."""
     node = LocaliserNode()
     node.autostart()
+    # What the imports have made stays; a collection that walks through it all holds up an image.
+    gc.collect()
+    gc.freeze()
     return node
