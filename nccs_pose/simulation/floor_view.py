@@ -68,11 +68,6 @@ class FloorView:
     block_centre: np.ndarray
     block_radius: np.ndarray
 
-    @property
-    def floor_pixel(self) -> np.ndarray:
-        """Index in the image of the pixels that see the floor (F,)."""
-        return self.pixel[: len(self.floor)]
-
 
 def reflected_rays(rig: Rig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give mirror points (N, 3) and unit reflected directions (N, 3) in base_link, and hits (N,).
