@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The image subscription: decoding, missing frames, silence."""
+"""The image subscription: which image next, decoding, missing frames, silence."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from typing import Any
 from nccs_pose.errors import FrameRefusedError, NccsPoseError
 from nccs_pose.ros.conversions import decode, stamp_to_ns
 from nccs_pose.ros.diagnostics import Tally
+from nccs_pose.ros.inputs import waiting
 from nccs_pose.ros.interface import IMAGE, IMAGE_COMPRESSED
 from nccs_pose.ros.qos import overridable, profile
 import numpy as np
@@ -37,6 +38,10 @@ OnFrame = Callable[[int, str, 'NDArray[np.uint8]'], None]
 
 class ImageStream:
     """Subscribes images and hands on each that can be decoded.
+
+    An image that waits is late. One that waits after a hiccup is caught up with; where one waits
+    behind every image that is taken, the machine is too slow, and the older of the two is let go.
+    A depth that the user chose is taken at its word: all that it keeps are used.
 
     Missing images are counted by the publisher's sequence numbers; what of them the middleware
     reports as lost was lost on the way, the rest was let go because the node was busy.
@@ -63,6 +68,7 @@ class ImageStream:
         self._tally = tally
         self._on_frame = on_frame
         self._sequence: int | None = None
+        self._behind = False
         self._incompatible = ''
         self._on_publishers = on_publishers
         self.publishers = 0
@@ -71,12 +77,15 @@ class ImageStream:
         self.arrived = time.monotonic()
         # rclpy's annotations know of one argument only.
         receive: Callable[..., None] = self._receive
+        qos = profile(endpoint)
         self._subscription = node.create_subscription(
-            kind, endpoint.name, receive, profile(endpoint),
+            kind, endpoint.name, receive, qos,
             event_callbacks=SubscriptionEventCallbacks(
                 message_lost=self._lost, incompatible_qos=self._mismatched,
                 matched=self._matched),
             qos_overriding_options=overridable())
+        # By now the user's choice, if there is one, stands in the profile.
+        self._waiting = 1 if qos.depth == endpoint.depth else 0
         self.topic = self._subscription.topic_name
 
     def close(self) -> None:
@@ -100,6 +109,13 @@ class ImageStream:
         return words
 
     def _receive(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
+        taken = [(message, info), *waiting(self._subscription, self._waiting)]
+        again, self._behind = self._behind, len(taken) > 1
+        # What is let go leaves a gap in the sequence numbers, as what the middleware replaces.
+        for each in taken[-1:] if again else taken:
+            self._use(*each)
+
+    def _use(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
         self.arrived = time.monotonic()
         self._tally.received += 1
         self._count_missing(info.get('publication_sequence_number'))

@@ -81,7 +81,7 @@ class Inputs:
 
     def use_waiting_odometry(self) -> None:
         """Hand on the odometry that has arrived and waits behind an image."""
-        for data in waiting(self._odometry, ODOM.depth):
+        for data, _ in waiting(self._odometry, ODOM.depth):
             self._odometry.callback(data)
 
     def _listen(self, endpoint: Endpoint, kind: Any, use: Callable[[Any], None]) -> Subscription:
@@ -122,8 +122,10 @@ class Inputs:
             self._on_camera_problem()
 
 
-def waiting(subscription: Subscription, most: int) -> Iterator[Any]:
+def waiting(subscription: Subscription, most: int) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Take the messages that have arrived and whose callback has not run yet, oldest first.
+
+    Each with what the middleware says of it (times, sequence number).
 
     An executor takes one message of each subscription in a round. Behind a callback of 30 ms the
     messages of a fast topic would wait longer and longer, until the oldest are dropped.
@@ -135,4 +137,4 @@ def waiting(subscription: Subscription, most: int) -> Iterator[Any]:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
         if taken is None:
             return
-        yield taken[0]
+        yield taken

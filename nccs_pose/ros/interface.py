@@ -39,12 +39,12 @@ class Endpoint:
     depth: int = 10
 
 
-# An image that waits is an image that is late: only the newest is kept.
+# An image that waits is late: no more are kept than a hiccup is caught up with (ImageStream).
 IMAGE = Endpoint(
-    'image', 'sensor_msgs/msg/Image', 'Images, when image_transport is raw.', False, 1)
+    'image', 'sensor_msgs/msg/Image', 'Images, when image_transport is raw.', False, 2)
 IMAGE_COMPRESSED = Endpoint(
     'image/compressed', 'sensor_msgs/msg/CompressedImage',
-    'JPEG or PNG images, when image_transport is compressed.', False, 1)
+    'JPEG or PNG images, when image_transport is compressed.', False, 2)
 CAMERA_INFO = Endpoint(
     'camera_info', 'sensor_msgs/msg/CameraInfo',
     'Only compared with the rig: a contradiction is an error that says both numbers.', False, 1)

@@ -103,9 +103,13 @@ class Listener(Node):
             PoseWithCovarianceStamped, 'pose', self._on_pose, QoSProfile(depth=100))
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
-    def send(self, frame: np.ndarray | bytes) -> None:
-        """Publish one prepared image, stamped now."""
-        stamp_ns = self.get_clock().now().nanoseconds
+    def send(self, frame: np.ndarray | bytes, late: float) -> None:
+        """Publish one prepared image, stamped when it was due `late` seconds ago.
+
+        A camera exposes in time, however late its driver comes to publish: stamped later, the
+        image would show a robot that moved by fits and starts.
+        """
+        stamp_ns = self.get_clock().now().nanoseconds - round(1e9 * late)
         message = (compressed_message(stamp_ns, 'camera_optical', frame)
                    if isinstance(frame, bytes)
                    else image_message(stamp_ns, 'camera_optical', frame))
@@ -211,14 +215,14 @@ def _measure(
     # To and fro: 0 1 2 ... n-1 ... 2 1, again and again.
     order = itertools.cycle([*range(len(frames)), *range(len(frames) - 2, 0, -1)])
     stream = (frames[k] for k in order)
-    _play(node, stream, round(WARM_UP * rate), rate)
+    _play(node, stream, range(round(WARM_UP * rate)), time.monotonic(), rate)
     before = _settle(node, (0,) * len(COUNTS), len(node.sent))
     node.forget()
     count = round(seconds * rate)
     start, cpu = time.monotonic(), _cpu_seconds(pid)
-    _play(node, stream, count // 5, rate)
+    _play(node, stream, range(count // 5), start, rate)
     early = _memory_mb(pid)
-    _play(node, stream, count - count // 5, rate)
+    _play(node, stream, range(count // 5, count), start, rate)
     share = (_cpu_seconds(pid) - cpu) / (time.monotonic() - start)
     late, load = _memory_mb(pid), os.getloadavg()[0]
     after = _settle(node, before, count)
@@ -230,13 +234,14 @@ def _measure(
 
 
 def _play(
-    node: Listener, stream: Iterator[np.ndarray | bytes], count: int, rate: float,
+    node: Listener, stream: Iterator[np.ndarray | bytes], numbers: range, start: float,
+    rate: float,
 ) -> None:
-    start = time.monotonic()
-    for k in range(count):
+    """Send images, each by its number in a schedule that began at `start`."""
+    for k in numbers:
         while (left := start + k / rate - time.monotonic()) > 0.0:
             rclpy.spin_once(node, timeout_sec=left)
-        node.send(next(stream))
+        node.send(next(stream), -left)
 
 
 def _settle(node: Listener, before: tuple[int, ...], count: int) -> tuple[int, ...]:

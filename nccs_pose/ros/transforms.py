@@ -94,7 +94,7 @@ class TransformOutput:
         if not self._pending:
             return
         # The listener's callbacks wait behind the images, as everything else does.
-        for message in waiting(self._listener.tf_sub, MOST_WAITING):
+        for message, _ in waiting(self._listener.tf_sub, MOST_WAITING):
             self._listener.callback(message)
         while self._pending:
             stamp_ns, pose = self._pending[0]

@@ -12,11 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What arrives beside the images: nothing waits behind them."""
+"""What waits while the node is busy: odometry behind an image, images behind each other."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 import os
+from typing import Any
 
 import pytest
 
@@ -31,6 +33,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -42,45 +45,116 @@ PARAMETERS = {
     'qos_overrides./image.subscription.reliability': 'reliable'}
 
 
-def test_odometry_that_arrived_before_an_image_is_used_before_it(tmp_path, monkeypatch):
+class Pair:
+    """The node and a user of it in one process, where it is known what has arrived."""
+
+    def __init__(self, context: Context, parameters: dict[str, Any]) -> None:
+        self.executor = SingleThreadedExecutor(context=context)
+        self.node = LocaliserNode(
+            context=context, use_global_arguments=False, parameter_overrides=[
+                Parameter(name, value=value) for name, value in parameters.items()])
+        self.executor.add_node(self.node)
+        self.node.autostart()
+        self.user = Node('user', context=context, use_global_arguments=False)
+
+    def publisher(self, kind: type, topic: str, depth: int) -> Any:
+        publisher = self.user.create_publisher(kind, topic, QoSProfile(depth=depth))
+        self.wait(publisher.get_subscription_count)
+        return publisher
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        for _ in range(1000):
+            if condition():
+                return
+            self.executor.spin_once(timeout_sec=0.02)
+        raise AssertionError('waited in vain')
+
+
+@pytest.fixture
+def pair(request, tmp_path, monkeypatch) -> Iterator[Pair]:
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
     context = Context()
     rclpy.init(context=context, domain_id=1 + os.getpid() % 99)
-    executor = SingleThreadedExecutor(context=context)
+    pair = Pair(context, {**PARAMETERS, **getattr(request, 'param', {})})
     try:
-        node = LocaliserNode(context=context, use_global_arguments=False, parameter_overrides=[
-            Parameter(name, value=value) for name, value in PARAMETERS.items()])
-        executor.add_node(node)
-        node.autostart()
-        seen: list[int] = []
-        before_image: list[int] = []
-        localiser = node._localiser
-        process = localiser.process
-        monkeypatch.setattr(localiser, 'add_odometry', lambda stamp, pose: seen.append(stamp))
-        monkeypatch.setattr(localiser, 'process', lambda stamp, image: (
-            before_image.append(len(seen)), process(stamp, image))[1])
-        user = rclpy.create_node('user', context=context, use_global_arguments=False)
-        odom = user.create_publisher(Odometry, 'odom', QoSProfile(depth=SAMPLES))
-        images = user.create_publisher(Image, 'image', QoSProfile(depth=1))
-        for _ in range(1000):
-            if odom.get_subscription_count() and images.get_subscription_count():
-                break
-            executor.spin_once(timeout_sec=0.02)
-        # All of it lies in the middleware before the executor looks again.
-        for k in range(SAMPLES):
-            odom.publish(odometry_message(
-                1 + k * 10_000_000, 'odom', 'base_link', Pose2(0.01 * k, 0.0, 0.0), 1.0, 0.0))
-        images.publish(image_message(
-            SAMPLES * 10_000_000, 'camera', np.zeros((480, 640, 3), np.uint8)))
-        assert odom.wait_for_all_acked(Duration(seconds=30))
-        assert images.wait_for_all_acked(Duration(seconds=30))
-        for _ in range(1000):
-            if before_image:
-                break
-            executor.spin_once(timeout_sec=0.02)
-        assert before_image == [SAMPLES]
-        assert seen == [1 + k * 10_000_000 for k in range(SAMPLES)]
-        node.close()
+        yield pair
+        pair.node.close()
     finally:
-        executor.shutdown()
+        pair.executor.shutdown()
         rclpy.shutdown(context=context)
+
+
+def black(number: int) -> Image:
+    return image_message(number * 10_000_000, 'camera', np.zeros((480, 640, 3), np.uint8))
+
+
+def deliver(publisher: Any, *messages: Any) -> None:
+    """Publish; when this returns they lie in the middleware."""
+    for message in messages:
+        publisher.publish(message)
+    assert publisher.wait_for_all_acked(Duration(seconds=30))
+
+
+def test_odometry_that_arrived_before_an_image_is_used_before_it(pair, monkeypatch):
+    seen: list[int] = []
+    before_image: list[int] = []
+    localiser = pair.node._localiser
+    process = localiser.process
+    monkeypatch.setattr(localiser, 'add_odometry', lambda stamp, pose: seen.append(stamp))
+    monkeypatch.setattr(localiser, 'process', lambda stamp, image: (
+        before_image.append(len(seen)), process(stamp, image))[1])
+    odom = pair.publisher(Odometry, 'odom', SAMPLES)
+    images = pair.publisher(Image, 'image', 1)
+    # All of it lies in the middleware before the executor looks again.
+    deliver(odom, *(odometry_message(
+        1 + k * 10_000_000, 'odom', 'base_link', Pose2(0.01 * k, 0.0, 0.0), 1.0, 0.0)
+        for k in range(SAMPLES)))
+    deliver(images, black(SAMPLES))
+    pair.wait(lambda: before_image)
+    assert before_image == [SAMPLES]
+    assert seen == [1 + k * 10_000_000 for k in range(SAMPLES)]
+
+
+def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
+    used: list[int] = []
+    localiser = pair.node._localiser
+    process = localiser.process
+    images = pair.publisher(Image, 'image', 2)
+    monkeypatch.setattr(localiser, 'process', lambda stamp, image: (
+        used.append(stamp // 10_000_000), process(stamp, image))[1])
+    deliver(images, black(1), black(2))
+    pair.wait(lambda: len(used) == 2)
+    deliver(images, black(3))
+    pair.wait(lambda: len(used) == 3)
+    tally = pair.node._tally
+    assert (used, tally.received, tally.let_go) == ([1, 2, 3], 3, 0)
+
+    # Now two images come in the time that one takes.
+    def slow(stamp: int, image: Any) -> Any:
+        used.append(stamp // 10_000_000)
+        if sent[-1] < 11:
+            sent.extend((sent[-1] + 1, sent[-1] + 2))
+            deliver(images, *map(black, sent[-2:]))
+        return process(stamp, image)
+
+    sent = [4, 5]
+    monkeypatch.setattr(localiser, 'process', slow)
+    deliver(images, *map(black, sent))
+    pair.wait(lambda: used[-1] == 11)
+    # 4 and 5 as before; meanwhile 8 and 9 replaced 6 and 7 in the middleware; from then on
+    # the older of two is let go.
+    assert used[3:] == [4, 5, 9, 11]
+    assert (tally.received, tally.let_go) == (7, 4)
+
+
+@pytest.mark.parametrize(
+    'pair', [{'qos_overrides./image.subscription.depth': 5}], indirect=True)
+def test_a_depth_of_the_users_choice_is_taken_at_its_word(pair, monkeypatch):
+    used: list[int] = []
+    process = pair.node._localiser.process
+    images = pair.publisher(Image, 'image', 5)
+    monkeypatch.setattr(pair.node._localiser, 'process', lambda stamp, image: (
+        used.append(stamp // 10_000_000), process(stamp, image))[1])
+    deliver(images, *map(black, range(1, 6)))
+    pair.wait(lambda: len(used) == 5)
+    assert (used, pair.node._tally.let_go) == ([1, 2, 3, 4, 5], 0)
