@@ -116,6 +116,32 @@ def test_the_first_image_gives_the_pose() -> None:
     assert first.quality.explained > 0.9
 
 
+@pytest.mark.parametrize(('asked', 'options'), [
+    (75, DEFAULTS), (20, LocaliserOptions(stations=20)), (150, LocaliserOptions(stations=150))])
+def test_so_many_points_of_each_line_are_measured_spread_along_it(
+        asked: int, options: LocaliserOptions) -> None:
+    drive = Drive(ideal_scene(1280, noise=0.02), Pose2(0.1, 0.1, 0.4), options)
+    points = drive.go().points
+    assert points is not None
+    rig = drive.scene.rig
+    for k, line in enumerate(drive.scene.line_map):
+        own = points.label == k
+        # Some of them are disturbed; a short piece of line has no room for the most of them.
+        room = 0.9 * asked if asked < 100 else 76
+        assert room < own.sum() <= asked
+        # Against the image of the tape's middle, projected point by point.
+        along = np.linspace(0.0, line.length, 4000)
+        curve, seen = rig.project(drive.pose.inverse().apply(
+            line.start + along[:, None] * line.direction))
+        pixels, curve = points.pixels[own], curve[seen]
+        near = np.linalg.norm(pixels[:, None] - curve, axis=2)
+        assert np.median(near.min(axis=1)) < 0.2
+        # From one end of what is seen to the other, and nowhere a hole.
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(curve, axis=0).T))])
+        place = np.concatenate([[0.0], np.sort(arc[near.argmin(axis=1)]), arc[-1:]])
+        assert np.diff(place).max() < 0.15 * arc[-1]
+
+
 def test_nothing_in_view_is_searching_and_later_lost() -> None:
     drive = Drive(SCENE, Pose2(0.3, -0.2, 2.0), wheels=False)
     assert drive.go(change=_black).state is State.SEARCHING

@@ -114,19 +114,35 @@ def test_measuring_again_at_the_measured_place_converges(half_width: float) -> N
 
 
 @pytest.mark.parametrize('half_width', [0.4, 1.0, 4.0])
-@pytest.mark.parametrize('noise', [4.0, 12.0])
-def test_sigma_is_the_scatter(half_width: float, noise: float) -> None:
+@pytest.mark.parametrize(('noise', 'spacing'), [(4.0, 16.0), (12.0, 16.0), (4.0, 3.0)])
+def test_sigma_is_the_scatter(half_width: float, noise: float, spacing: float) -> None:
     shifts, sigmas = [], []
     for seed in range(6):
         image = _tape(half_width, 0.1, noise, seed)
         fit, _ = fit_profiles(
-            image, _straight_bands(half_width, 0.1, 0.0), _colour())
+            image, _straight_bands(half_width, 0.1, 0.0, spacing), _colour())
         shifts.append(fit.shift[fit.found])
         sigmas.append(fit.sigma[fit.found])
     shift, sigma = np.concatenate(shifts), np.concatenate(sigmas)
     scatter = 1.4826 * np.median(np.abs(shift - np.median(shift)))
     assert 0.7 < np.median(sigma) / scatter < 1.4
     assert abs(shift.mean()) < 4.0 * scatter / np.sqrt(len(shift)) + 0.01
+
+
+@pytest.mark.parametrize('half_width', [0.6, 3.0])
+def test_close_stations_say_together_what_distant_ones_do(half_width: float) -> None:
+    image, green = _tape(half_width, 0.1, 6.0), _colour()
+    coarse, _ = fit_profiles(image, _straight_bands(half_width, 0.1, 0.1, 16.0), green)
+    fine, _ = fit_profiles(image, _straight_bands(half_width, 0.1, 0.1, 2.0), green)
+    assert fine.found.all()
+    assert coarse.found.all()
+    weight = fine.sigma**-2.0
+    information = coarse.sigma**-2.0
+    together = float(weight @ fine.shift / weight.sum())
+    apart = float(information @ coarse.shift / information.sum())
+    # The same pixels but for a few at the ends: the difference is a part of their common noise.
+    assert abs(together - apart) < 0.7 / np.sqrt(information.sum())
+    assert weight.sum() == pytest.approx(information.sum(), rel=0.2)
 
 
 def test_noise_twice_as_strong_doubles_sigma() -> None:

@@ -22,7 +22,7 @@ from nccs_pose.estimation.common_errors import common_errors
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import solve_shifts
+from nccs_pose.estimation.shift_solve import pooled, solve_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
@@ -34,12 +34,13 @@ from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR
 import numpy as np
 from numpy.typing import NDArray
 
-# Stations stand this far apart in the image and average all of it, px.
-_SPACING = 16.0
+# Stations stand no closer in the image than this, px; of a short piece there are fewer.
+_SPACING = 2.0
 # Where the image is sharp, so that a tape is felt from nearby only, a first, rough pass takes one
-# station of so many; a search, so many of each line.
-_ROUGH = 2
+# station of so many; a search takes so many of each line, this far apart (px) or more.
+_ROUGH = 4
 _SEARCHED = 25
+_SEARCHED_SPACING = 8.0
 # A profile is linear in its shift for about so many pixels.
 _LINEAR_PX = 2.0
 _ITERATIONS = 8
@@ -55,7 +56,9 @@ _LEARNED_BLUR = 0.1
 _MOVED_PX = 3.0
 # What still steps at the end, by less than this (m and rad), is uncertain by that much more.
 _LAST_STEP = 0.005
+# A pose rests on so many stations, and on so much of curve, px.
 _LEAST_STATIONS = 12
+_LEAST_LENGTH = 192.0
 # Of a searched pose this part of what must be found at the end has to be found from the first.
 _HOPELESS = 0.8
 # A line of so many pixels of curve, so wide in the image (px), of which less than this fraction
@@ -187,7 +190,7 @@ class Aligner:
             return fit, (learned,)
         n = len(bands)
         shift, sigma, contrast = np.zeros(n), np.ones(n), np.zeros(n)
-        found = np.zeros(n, dtype=bool)
+        found, group = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.intp)
         learned_all = list(colours)
         for k, colour in enumerate(colours):
             own = self._colour_of_line[bands.label] == k
@@ -195,14 +198,14 @@ class Aligner:
                 fit, learned_all[k] = fit_profiles(
                     image, bands[own], colour, rough=rough)
                 shift[own], sigma[own], contrast[own] = fit.shift, fit.sigma, fit.contrast
-                found[own] = fit.found
-        return ProfileFit(shift, sigma, contrast, found), tuple(learned_all)
+                found[own], group[own] = fit.found, k * n + fit.group
+        return ProfileFit(shift, sigma, contrast, found, group), tuple(learned_all)
 
     def _search(
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
         reach: float, prior: tuple[Pose2, Array] | None,
     ) -> Pose2 | None:
-        places = self._predictor.places(start, _SPACING / 2.0, _SEARCHED)
+        places = self._predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
         bands, slide = self._predictor.bands(places, start)
         shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
         for k, colour in enumerate(colours):
@@ -213,16 +216,16 @@ class Aligner:
         if found.sum() < _LEAST_STATIONS:
             return None
         return self._solved(
-            shift[found], np.ones(int(found.sum())), slide[found], bands.across[found], start,
-            prior).pose
+            shift[found], np.ones(int(found.sum())), slide[found], np.flatnonzero(found),
+            bands.across[found], start, prior).pose
 
     def _solved(
-        self, shift: Array, sigma: Array, slide: Array, across: Array, start: Pose2,
-        prior: tuple[Pose2, Array] | None,
+        self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp], across: Array,
+        start: Pose2, prior: tuple[Pose2, Array] | None,
     ) -> Refinement:
         options = self._options
         return solve_shifts(
-            shift, sigma, slide, start, prior=prior,
+            shift, sigma, slide, group, start, prior=prior,
             attitude_sigma=(options.height_sigma, options.tilt_sigma),
             image_shift=across, calibration_sigma=options.calibration_sigma)
 
@@ -245,9 +248,11 @@ class Aligner:
         used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
         if used.sum() < _LEAST_STATIONS:
             return None
+        if not rough and bands.spacing[used].sum() < _LEAST_LENGTH:
+            return None
         refinement = self._solved(
-            (known + fit.shift)[used], fit.sigma[used], slide[used], bands.across[used], start,
-            prior)
+            (known + fit.shift)[used], fit.sigma[used], slide[used], fit.group[used],
+            bands.across[used], start, prior)
         step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
                          float(wrap_angle(refinement.pose.yaw - start.yaw)),
                          *(refinement.attitude - attitude)])
@@ -265,7 +270,10 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     sigma, label = fit.sigma[index], bands.label[index]
     scale = float(np.sqrt(np.mean(residual**2)))
     pixels = bands.midline[index] + fit.shift[index, None] * bands.across[index]
-    correlation, misfit = common_errors(residual, sigma, label)
+    first = np.flatnonzero(np.diff(fit.group[index], prepend=-1))
+    together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
+    correlation, misfit = common_errors(
+        pooled(residual, fit.group[index]), together, label[first])
     return Alignment(
         refinement.pose, correlation * refinement.covariance, refinement,
         LinePoints(pixels, scale * sigma, label), float(worth[index].sum() / worth.sum()),

@@ -47,8 +47,8 @@ class LocaliserOptions:
             'the widest tape.')
     stations: int = option(
         75, low=5, high=1000, live=True,
-        doc='Points measured on each line at most (the paper takes 75); 16 px apart or more, each '
-            'reads all pixels of its stretch.')
+        doc='Points measured on each line, spread evenly along what is seen of it (75 as in the '
+            'paper); fewer where they would stand closer than 2 px.')
     blur: float = option(
         0.7, unit='px', low=0.2, high=5.0, live=True,
         doc='Blur of an edge in the image, standard deviation: a start, each image says its own.')

@@ -24,6 +24,7 @@ from __future__ import annotations
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 import numpy as np
+from numpy.typing import NDArray
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
@@ -40,6 +41,7 @@ def solve_shifts(
     shift: Array,
     sigma: Array,
     slide: Array,
+    group: NDArray[np.intp],
     start: Pose2,
     *,
     prior: tuple[Pose2, Array] | None = None,
@@ -51,11 +53,14 @@ def solve_shifts(
 
     Re-weighted least squares under Cauchy's loss with its scale estimated from the residuals,
     then least squares over the inliers, from which the covariance comes; ``sigma`` is taken for
-    relative there, and its scale from the residuals.
+    relative there, and its scale from the residuals. What is robustly weighted is the sum of
+    neighbours' residuals: what disturbs a stretch of line disturbs all of it, and shows in the
+    sum before it shows in any one.
 
     :param shift: of the stations (N,), px.
     :param sigma: their standard deviations (N,), px.
     :param slide: d(shift)/d(x, y, yaw, z, roll, pitch) (N, 6).
+    :param group: of neighbours that each belongs to (N,), those of a group together.
     :param start: the predicted pose, T_map_base.
     :param prior: a pose with its covariance (3, 3), weighed in like a measurement.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
@@ -70,10 +75,12 @@ def solve_shifts(
     told = known @ expected
     known = known + vague
     unknowns, scale = np.zeros(len(free)), 1.0
+    number = np.cumsum(np.diff(group, prepend=group[:1]) != 0)
     e = right
     for _ in range(_ITERATIONS):
-        scale = _robust_scale(e)
-        weighted = jacobian / (1.0 + np.square(e / (_CAUCHY * scale)))[:, None]
+        common = pooled(e, group)
+        scale = _robust_scale(common)
+        weighted = jacobian / (1.0 + np.square(common / (_CAUCHY * scale)))[number, None]
         normal = weighted.T @ jacobian + known
         before = unknowns
         unknowns = np.linalg.solve(normal, weighted.T @ right + told)
@@ -81,16 +88,16 @@ def solve_shifts(
         step = unknowns - before
         if step @ normal @ step < 1e-2:
             break
-    inlier = np.abs(e) <= _GATE * _robust_scale(e)
+    common = pooled(e, group)
+    inlier = (np.abs(common) <= _GATE * _robust_scale(common))[number]
     trusted = jacobian[inlier]
     normal = trusted.T @ trusted
     # The prior's share is weighed against residuals of the size that they have.
-    degrees = max(1, len(trusted) - 3)
-    inflation = max(1e-6, float(e[inlier] @ e[inlier]) / (_WITHIN_GATE * degrees))
+    inflation = _inflation(e[inlier], group[inlier])
     unknowns = np.linalg.solve(
         normal / inflation + known, trusted.T @ right[inlier] / inflation + told)
     e = right - jacobian @ unknowns
-    inflation = max(1e-6, float(e[inlier] @ e[inlier]) / (_WITHIN_GATE * degrees))
+    inflation = _inflation(e[inlier], group[inlier])
     covariance = np.linalg.inv(normal / inflation + known)
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
@@ -118,6 +125,18 @@ def _prior(
     for place, unknown in enumerate(free[3:], start=3):
         information[place, place] = (height if unknown == 3 else tilt) ** -2.0
     return free, information, expected
+
+
+def pooled(e: Array, group: NDArray[np.intp]) -> Array:
+    """Whitened residuals (N,) of groups of neighbours (N,), summed to whitened ones (G,)."""
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    return np.add.reduceat(e, first) / np.sqrt(np.diff([*first, len(e)]))
+
+
+def _inflation(e: Array, group: NDArray[np.intp]) -> float:
+    """Variance of the inlying groups' residuals (N,) against the noise told."""
+    common = pooled(e, group)
+    return max(1e-6, float(common @ common) / (_WITHIN_GATE * max(1, len(common) - 3)))
 
 
 def _robust_scale(e: Array) -> float:

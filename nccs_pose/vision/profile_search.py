@@ -46,7 +46,7 @@ def search_profiles(
     noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0), height.astype(float),
-        height > max(FOUND * noise, FOUND_FRACTION))
+        height > max(FOUND * noise, FOUND_FRACTION), rows)
 
 
 def contrast_across(

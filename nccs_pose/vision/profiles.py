@@ -48,6 +48,8 @@ _LEAST_DENSITY = 0.45
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
 _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
+# Stations over so many px share what they know of the floor, the contrast and the noise.
+_SHARED_PX = 16.0
 # At most so many pixels of a station are looked for along and across.
 _MOST_ALONG, _MOST_ACROSS = 40, 31
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
@@ -73,12 +75,14 @@ class ProfileFit:
     :ivar sigma: its standard deviation (N,), px.
     :ivar contrast: height of the profile over that of its line (N,); 1 is as expected.
     :ivar found: whether a tape is there at all (N,).
+    :ivar group: number of the stretch of line (N,) whose floor, contrast and noise it shares.
     """
 
     shift: Array
     sigma: Array
     contrast: Array
     found: NDArray[np.bool_]
+    group: NDArray[np.intp]
 
 
 def _read_pixels(
@@ -96,7 +100,7 @@ def _read_pixels(
     bend = (0.5 * bands.bend).astype(np.float32)[:, None]
     half_band = (bands.half_width + margin).astype(np.float32)
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    m = max(min(math.ceil(density * float(bands.spacing.mean())), _MOST_ALONG), 2)
+    m = max(min(round(density * float(bands.spacing.mean())), _MOST_ALONG), 1)
     t = bands.spacing.astype(np.float32)[:, None] * (
         (np.arange(m, dtype=np.float32) + 0.5) / m - 0.5)
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
@@ -131,8 +135,8 @@ def _products(
 
     :param pixels: (N, P, 3) BGR.
     :param s: their place across the curve (N, P), px.
-    :returns: products (N, 7, 7) of T, D, s, B and the three channels, all less their means; and
-        the floor's colour (3,).
+    :returns: products of T, D, s, B and the three channels with each other and with 1 (N, 7, 8);
+        and the floor's colour (3,), which the channels are less.
     """
     n, count = s.shape
     floor = pixels[:, 0].mean(axis=0)
@@ -161,12 +165,38 @@ def _products(
     rows[:, 7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     products = (rows[:, :7] @ rows.transpose(0, 2, 1)).astype(float)
-    sums = products[:, :, 7]
-    products = products[:, :, :7] - sums[:, :, None] * (sums / count)[:, None, :]
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
-    scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0])
-    products *= scale[:, None] * scale
+    scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
+    products *= scale[:7, None] * scale
     return products, floor
+
+
+@dataclass(frozen=True, eq=False)
+class _Groups:
+    """Neighbours on a line that share what is no shift.
+
+    :ivar first: member of each group (G,).
+    :ivar members: how many (G,).
+    :ivar number: group of each station (N,).
+    """
+
+    first: NDArray[np.intp]
+    members: NDArray[np.intp]
+    number: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, bands: Bands) -> _Groups:
+        """Parts of equal length of each line; the label ascends."""
+        n, cut = len(bands), np.flatnonzero(np.diff(bands.label)) + 1
+        begin = np.concatenate([[0], cut])
+        line = np.repeat(np.arange(len(begin)), np.diff([*begin, n]))
+        length = np.add.reduceat(bands.spacing, begin)
+        place = np.cumsum(bands.spacing) - 0.5 * bands.spacing - (np.cumsum(length) - length)[line]
+        parts = np.maximum(length // _SHARED_PX, 1.0)
+        part = (place * (parts / length)[line]).astype(int)
+        first = np.flatnonzero(np.diff(line, prepend=-1) | np.diff(part, prepend=-1))
+        members = np.diff([*first, n])
+        return cls(first, members, np.repeat(np.arange(len(first)), members))
 
 
 def fit_profiles(
@@ -183,21 +213,28 @@ def fit_profiles(
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     pixels, s = _read_pixels(image, bands, margin, density)
-    count = s.shape[1]
     products, floor = _products(pixels, s, bands.half_width, blur)
-    system = _eliminated(products)
+    groups, count = _Groups.of(bands), s.shape[1]
+    pooled = np.add.reduceat(products, groups.first, axis=0)
+    size = count * groups.members
+    means = pooled[:, :, 7] / size[:, None]
+    centred = pooled[:, :, :7] - means[:, :, None] * pooled[:, None, :, 7]
+    system = _eliminated(centred)
     if not rough:
-        colour = colour.learn(system.height, system.power, system.left / (count - 4), floor)
-    fit = _shifts(bands.label, system, colour.discriminant, count, np.maximum(
-        # Where the grid is finer than the pixels, each of them is counted several times.
-        count / (bands.spacing * 2.0 * (bands.half_width + margin)), 1.0), 2.0 * bands.half_width)
+        colour = colour.learn(
+            system.height, system.power, system.left / (size - 4)[:, None, None], floor)
+    # Where the grid is finer than the pixels, each of them is counted several times.
+    repeats = np.maximum(
+        count / (bands.spacing * 2.0 * (bands.half_width + margin)), 1.0)
+    fit, shared = _shifts(
+        products, means, system, colour.discriminant, groups, size, bands, repeats)
     # A template beside its tape would take the misfit for blur.
-    if not rough and float(np.median(np.abs(fit.shift))) < _SHARP_PX:
-        share = products[:, 3, 0] / system.power
+    if not rough and float(np.median(np.abs(shared))) < _SHARP_PX:
+        share = centred[:, 3, 0] / system.power
         colour = colour.sharpen(
             system.height @ colour.discriminant,
-            (products[:, 3, 4:] - share[:, None] * products[:, 0, 4:]) @ colour.discriminant,
-            products[:, 3, 3] - share * products[:, 3, 0])
+            (centred[:, 3, 4:] - share[:, None] * centred[:, 0, 4:]) @ colour.discriminant,
+            centred[:, 3, 3] - share * centred[:, 3, 0])
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
     return replace(fit, shift=gain * fit.shift, sigma=gain * fit.sigma), colour
@@ -205,20 +242,22 @@ def fit_profiles(
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The normal equations of N stations after elimination: contrast, floor's slope, shift.
+    """The normal equations of G groups after elimination: contrast, floor's slope, shift.
 
-    :ivar power: of T (N,).
-    :ivar height: contrast of each channel (N, 3).
-    :ivar by_shift: what a unit of D has of T (N,).
-    :ivar slope_power, slope: what is left of s, and of its products with the channels (N, 3).
+    :ivar power: of T (G,).
+    :ivar height: contrast of each channel (G, 3).
+    :ivar by_shift: what a unit of D has of T (G,).
+    :ivar by_slope: what a unit of s has of T (G,).
+    :ivar slope_power, slope: what is left of s, and of its products with the channels (G, 3).
     :ivar own_power, own: what is left of D beside T, likewise.
-    :ivar crossed: product of the two (N,).
-    :ivar left: products of the channels with each other that no template explains (N, 3, 3).
+    :ivar crossed: product of the two (G,).
+    :ivar left: products of the channels with each other that no template explains (G, 3, 3).
     """
 
     power: Array
     height: Array
     by_shift: Array
+    by_slope: Array
     slope_power: Array
     slope: Array
     own_power: Array
@@ -241,40 +280,58 @@ def _eliminated(products: Array) -> _System:
     left = (rest[:, 4:, 4:] - slope[:, :, None] * (slope / slope_power[:, None])[:, None]
             - alone[:, :, None] * (alone / alone_power[:, None])[:, None])
     return _System(
-        power, shares[:, 4:], shares[:, 1], slope_power, slope, own_power, own, crossed, left)
+        power, shares[:, 4:], shares[:, 1], shares[:, 2], slope_power, slope, own_power, own,
+        crossed, left)
 
 
 def _shifts(
-    label: NDArray[np.intp], system: _System, weights: Array, count: int, repeats: Array,
-    width: Array,
-) -> ProfileFit:
+    products: Array, means: Array, system: _System, weights: Array, groups: _Groups,
+    size: NDArray[np.intp], bands: Bands, repeats: Array,
+) -> tuple[ProfileFit, Array]:
     """Shifts and their noise along a colour's discriminant.
 
+    :param products: of the stations (N, 7, 8).
+    :param means: of T, D, s, B and the channels over each group (G, 7).
     :param weights: the discriminant (3,).
-    :param count: of samples.
-    :param repeats: how often each pixel is among them (N,).
+    :param size: samples of each group (G,).
+    :param repeats: how often each pixel is among a station's samples (N,).
+    :returns: the stations' fit, and the shift of each group as a whole (G,), px.
     """
     power, slope = system.power, system.slope @ weights
-    variance = np.maximum((system.left @ weights) @ weights / (count - 4), 1e-12)
-    usual = float(np.median(variance))
+    variance = np.maximum((system.left @ weights) @ weights / (size - 4), 1e-12)
+    usual = float(np.partition(variance, len(variance) // 2)[len(variance) // 2])
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
     # A slope of the floor costs a wide tape much of what it tells. How far the slopes of all
-    # stations exceed their noise says how much of each is to be believed.
+    # groups exceed their noise says how much of each is to be believed.
     excess = float(np.mean(slope * slope / (system.slope_power * variance))) - 1.0
-    share = (max(excess, 0.0) / (1.0 + max(excess, 0.0))) * system.crossed / system.slope_power
+    belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
+    share = belief * system.crossed / system.slope_power
     shift_power = np.maximum(system.own_power - share * system.crossed, 1e-9)
-    variance *= repeats
+    variance = variance * repeats[groups.first]
     moved = (system.own @ weights - share * slope) / shift_power
     a = system.height @ weights - system.by_shift * moved
     told = power / variance
-    level, certain = _levels(label, a, power, told, width)
+    label = bands.label[groups.first]
+    level, certain = _levels(label, a, power, told, 2.0 * bands.half_width[groups.first])
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
-    # One station's contrast is noisy where the tape is thin; its neighbours know better.
+    # One group's contrast is noisy where the tape is thin; its neighbours know better.
     prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
     smooth = np.maximum((a * told + level * prior) / (told + prior), 1e-9)
+    # What each station's pixels say to D beside the floor and the contrast of its group; the
+    # weighted mean over the group is the group's own shift.
+    tilt = belief * (slope - system.crossed * moved) / system.slope_power
+    height = a - system.by_slope * tilt
+    base = means[:, 4:] @ weights - height * means[:, 0] - moved * means[:, 1] - tilt * means[:, 2]
+    of = groups.number
+    by_template = products[:, 1]
+    own_power = np.maximum(by_template[:, 1], 1e-9)
+    own = (by_template[:, 4:7] @ weights - height[of] * by_template[:, 0]
+           - tilt[of] * by_template[:, 2] - base[of] * by_template[:, 7])
+    part = own_power / np.add.reduceat(own_power, groups.first)[of]
+    sigma = np.sqrt(variance[of] / (part * shift_power[of])) / smooth[of]
     return ProfileFit(
-        moved / smooth, np.sqrt(variance / shift_power) / smooth, a / level, found)
+        own / own_power / smooth[of], sigma, (a / level)[of], found[of], of), moved / smooth
 
 
 def _levels(
