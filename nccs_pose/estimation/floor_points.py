@@ -52,6 +52,7 @@ class FloorPoints:
     def of(cls, segmentation: Segmentation, table: FloorTable, width: float) -> FloorPoints:
         """Lay blobs on the floor, for tapes of a width in metres."""
         floor, jacobian = table.floor(segmentation.pixels)
+        jacobian = jacobian * segmentation.pitch
         by_u, by_v = jacobian[:, :, 0], jacobian[:, :, 1]
         spread = np.stack([
             by_u[:, 0] ** 2 + by_v[:, 0] ** 2, by_u[:, 0] * by_u[:, 1] + by_v[:, 0] * by_v[:, 1],

@@ -64,6 +64,8 @@ _TRIED = 6
 _SEARCH_BAND = 5.0
 # Of a search's poses only those count that score this fraction of the best.
 _WORTH_TRYING = 0.6
+# A search that leaves less than this unexplained looks no closer.
+_PLAIN = 0.8
 # A pose elsewhere must beat the tracked one by this much to unseat it.
 _BETTER = 0.15
 # A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
@@ -257,10 +259,7 @@ class Localiser:
         refused: _Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
-        segments = self._searcher.segments(image)
-        watch.lap('detect')
-        candidates = self._searcher.candidates(segments)
-        watch.lap('associate')
+        segments, candidates = self._seen(image, watch)
         now = self._odometry.at(stamp_ns)
         hypotheses = carried(self._open, self._open_odometry, now)
         sifted = self._sift(image, candidates, hypotheses, segments, prediction, watch)
@@ -296,6 +295,24 @@ class Localiser:
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
         return self._undecided(stamp_ns, held, watch)
+
+    def _seen(
+        self, image: NDArray[np.uint8], watch: _Stopwatch,
+    ) -> tuple[tuple[FloorSegment, ...], tuple[Candidate, ...]]:
+        """The strips of the look at an image that a pose explains best, and its candidates."""
+        segments: tuple[FloorSegment, ...] = ()
+        candidates: tuple[Candidate, ...] = ()
+        for number, look in enumerate(self._searcher.looks):
+            strips = look(image, segments)
+            watch.lap('detect')
+            poses = self._searcher.candidates(strips)
+            watch.lap('associate')
+            if number == 0 or (poses and (
+                    not candidates or poses[0].score > candidates[0].score)):
+                segments, candidates = strips, poses
+            if candidates and candidates[0].score > _PLAIN:
+                break
+        return segments, candidates
 
     def _sift(
         self, image: NDArray[np.uint8], candidates: tuple[Candidate, ...],

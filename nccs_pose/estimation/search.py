@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-import cv2
+from collections.abc import Callable
+
 from nccs_pose.estimation.association import global_candidates, score_pose
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
@@ -24,66 +25,96 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.vision.segment import chromatic_mask, find_blobs, hsv_mask, Segmentation
+from nccs_pose.vision.learned_contrast import learned_weights, weighted
+from nccs_pose.vision.reduced import ReducedView
+from nccs_pose.vision.segment import brightness, chromatic_mask, hsv_mask, Mask, raised_mask
 import numpy as np
 from numpy.typing import NDArray
 
 # Enough for a blob over all lines of a field at once.
 _PIXELS_PER_BLOB = 400
-# With fewer strips than this the image is looked at again, for tapes spread out by blur.
-_ENOUGH = 3
+# Lines are looked for in an image halved as often as it stays so wide, px; there the surroundings
+# of a pixel are no narrower than this.
+_WIDTH = 320
+_LEAST_WINDOW = 5
+
+Strips = tuple[FloorSegment, ...]
+Look = Callable[[NDArray[np.uint8], Strips], Strips]
 
 
 class Searcher:
-    """Finds line-like strips in images and the poses that explain them, for one rig and map."""
+    """Finds line-like strips in images and the poses that explain them, for one rig and map.
+
+    :ivar looks: ways to find the strips of an image, the one that suffices for most images first;
+        each may make use of strips that were found before.
+    """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
         self._table = table
         self._map = line_map
         self._options = options
-        self._colours = tuple(dict.fromkeys(line.colour for line in line_map))
-        rows, columns = np.flatnonzero(table.region.any(1)), np.flatnonzero(table.region.any(0))
-        self._rows = slice(int(rows[0]), int(rows[-1]) + 1)
-        self._columns = slice(int(columns[0]), int(columns[-1]) + 1)
-        self._region = np.ascontiguousarray(table.region[self._rows, self._columns])
+        self._widths: dict[str, float] = {}
+        for line in line_map:
+            self._widths[line.colour] = max(line.width, self._widths.get(line.colour, 0.0))
+        # The paper's threshold is one of whole pixels.
+        by_hsv, pitch = options.threshold == 'hsv', 1
+        while not by_hsv and table.rig.camera.width >= 2 * pitch * _WIDTH:
+            pitch *= 2
+        self._view = ReducedView.of(table.region, pitch)
+        self._closer = ReducedView.of(table.region, max(pitch // 2, 1))
+        self.looks: tuple[Look, ...] = (
+            lambda image, _: self.segments(image),
+            self._look_by_example,
+            # A tape no brighter than the pattern of its floor shows in a sharp image only.
+            lambda image, _: self._look(image, self._closer))
+        if by_hsv:
+            self.looks = self.looks[:1]
 
-    def segmentation(
-        self, image: NDArray[np.uint8], colour: str, *, narrow: bool = False,
-    ) -> Segmentation:
-        """Blobs of one colour where the image shows the floor, or only their ridges."""
-        part = image[self._rows, self._columns]
-        options = self._options
+    def segments(self, image: NDArray[np.uint8]) -> Strips:
+        """Straight strips of the map's colours on the floor, the largest first."""
+        return self._look(image, self._view)
+
+    def _look(self, image: NDArray[np.uint8], view: ReducedView) -> Strips:
+        options, part = self._options, view.read(image)
         if options.threshold == 'hsv':
-            mask = hsv_mask(part, colour)
+            masks = {colour: hsv_mask(part, colour) for colour in self._widths}
         else:
-            mask = chromatic_mask(
-                part, colour, options.noise_gate, options.least_contrast, options.window,
-                narrow=narrow)
-        found = find_blobs(cv2.bitwise_and(mask, self._region), _PIXELS_PER_BLOB)
-        origin = np.array([self._columns.start, self._rows.start], dtype=float)
-        return Segmentation(found.mask, found.pixels + origin, found.label, found.weight)
+            masks = {
+                colour: chromatic_mask(
+                    part, colour, options.noise_gate, options.least_contrast, self._window(view))
+                for colour in self._widths}
+        return self._strips(masks, view)
 
-    def segments(self, image: NDArray[np.uint8]) -> tuple[FloorSegment, ...]:
-        """Straight strips of the map's colours on the floor."""
-        found = self._strips(image, narrow=False)
-        if len(found) < _ENOUGH and self._options.threshold == 'chromaticity':
-            ridges = self._strips(image, narrow=True)
-            found = ridges if len(ridges) > len(found) else found
+    def _look_by_example(self, image: NDArray[np.uint8], known: Strips) -> Strips:
+        """Look for what looks like the strips that are known."""
+        options, view = self._options, self._view
+        part, window = view.read(image), self._window(view)
+        masks: dict[str, Mask] = {}
+        for colour in self._widths:
+            examples = [strip.pixels for strip in known if strip.colour == colour]
+            weights = learned_weights(
+                part, view.places(np.concatenate(examples)), view.region, window,
+            ) if examples else None
+            if weights is not None:
+                masks[colour] = raised_mask(
+                    weighted(part, weights), brightness(part), options.noise_gate,
+                    options.least_contrast, window)
+        return self._strips(masks, view)
+
+    def _window(self, view: ReducedView) -> int:
+        return max(_LEAST_WINDOW, self._options.window // view.pitch)
+
+    def _strips(self, masks: dict[str, Mask], view: ReducedView) -> Strips:
+        found: list[FloorSegment] = []
+        for colour, mask in masks.items():
+            found.extend(floor_segments(
+                view.blobs(mask, _PIXELS_PER_BLOB), self._table, self._widths[colour], colour))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def _strips(self, image: NDArray[np.uint8], *, narrow: bool) -> list[FloorSegment]:
-        found: list[FloorSegment] = []
-        for colour in self._colours:
-            widths = [line.width for line in self._map if line.colour == colour]
-            found.extend(floor_segments(
-                self.segmentation(image, colour, narrow=narrow), self._table, max(widths),
-                colour))
-        return found
-
-    def candidates(self, segments: tuple[FloorSegment, ...]) -> tuple[Candidate, ...]:
+    def candidates(self, segments: Strips) -> tuple[Candidate, ...]:
         """Poses that explain the strips, best first."""
         return global_candidates(segments, self._map, self._table)
 
-    def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
+    def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""
         return score_pose(pose, segments, self._map, self._table)

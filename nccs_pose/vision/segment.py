@@ -37,10 +37,10 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
 }
 # A pixel of a tape has this part of the highest contrast so near.
 _PART_OF_PEAK = 0.45
-_RIDGE = 0.65
 _NEAR_PEAK = np.ones((5, 5), np.uint8)
-# Blobs with a shorter outline are noise, px.
+# Blobs with a shorter outline are noise, px; one of a smaller image may be so short.
 _SMALLEST = 8
+_SMALLEST_REDUCED = 5
 # More blobs than this are clutter; the longest are kept (a byte numbers them).
 _MOST = 150
 
@@ -53,17 +53,18 @@ class Segmentation:
     :ivar pixels: pixels (P, 2) of the blobs, u and v, at most a fixed number of each blob.
     :ivar label: blob of each (P,).
     :ivar weight: how many pixels of its blob each stands for (P,).
+    :ivar pitch: side of what was one pixel when the blobs were found, px.
     """
 
     mask: Mask
     pixels: Array
     label: NDArray[np.intp]
     weight: Array
+    pitch: int = 1
 
 
 def chromatic_mask(
-    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int, *,
-    narrow: bool = False,
+    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int,
 ) -> Mask:
     """Where the image has more of a colour than its surroundings.
 
@@ -74,23 +75,33 @@ def chromatic_mask(
     :param gate: threshold in standard deviations of the image's noise.
     :param least: smallest contrast that counts, as a fraction of the image's brightness.
     :param window: width of the surroundings, px.
-    :param narrow: keep only the ridge of what is spread out by blur, or by the coarse colour of a
-        JPEG; it may cut the ends off a thin tape.
     """
-    feature = _contrast(image, colour)
+    return raised_mask(_contrast(image, colour), brightness(image), gate, least, window)
+
+
+def brightness(image: NDArray[np.uint8]) -> float:
+    """How bright an image is, grey levels."""
+    return float(np.median(image[::8, ::8, 1]))
+
+
+def raised_mask(feature: Mask, bright: float, gate: float, least: float, window: int) -> Mask:
+    """Where a feature stands out of its surroundings; see :func:`chromatic_mask`.
+
+    :param feature: (H, W) uint8, high on tapes.
+    :param bright: brightness of the image, grey levels.
+    """
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
     around = cv2.blur(feature, (window, window))
     sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
     noise = 1.4826 * float(np.median(np.abs(sparse)))
-    brightness = float(np.median(image[::8, ::8, 1]))
-    threshold = max(2.0, gate * noise, least * brightness)
+    threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
     # whole.
     height = cv2.subtract(feature, float(np.median(feature[::8, ::8])))
     peak = cv2.convertScaleAbs(
-        cv2.dilate(height, _NEAR_PEAK), alpha=_RIDGE if narrow else _PART_OF_PEAK)
+        cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
 
 
@@ -128,16 +139,19 @@ def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
     return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), low, high)
 
 
-def find_blobs(mask: Mask, pixels_per_blob: int) -> Segmentation:
+def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentation:
     """Close small gaps and collect what lies within the contours of a mask.
 
     Tapes may be a pixel wide, so nothing is ever eroded.
 
     :param mask: (H, W) uint8, 255 inside.
+    :param pitch: the mask is of an image so many times smaller; pixels and weights are given in
+        those of the image itself.
     """
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    kept = sorted((c for c in contours if len(c) >= _SMALLEST), key=len, reverse=True)[:_MOST]
+    smallest = _SMALLEST if pitch == 1 else _SMALLEST_REDUCED
+    kept = sorted((c for c in contours if len(c) >= smallest), key=len, reverse=True)[:_MOST]
     # Filling the few contours that matter is far cheaper than labelling every pixel.
     filled = np.zeros_like(closed)
     for number, contour in enumerate(kept, start=1):
@@ -154,5 +168,5 @@ def find_blobs(mask: Mask, pixels_per_blob: int) -> Segmentation:
     chosen = np.flatnonzero((np.arange(len(blob)) - first[blob]) % stride[blob] == 0)
     row, column = np.divmod(place[order[chosen]], mask.shape[1])
     return Segmentation(
-        closed, np.column_stack([column, row]).astype(float), blob[chosen],
-        stride[blob[chosen]].astype(float))
+        closed, pitch * np.column_stack([column, row]) + 0.5 * (pitch - 1), blob[chosen],
+        stride[blob[chosen]] * float(pitch * pitch), pitch)

@@ -1,0 +1,70 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The colour difference that tells a tape best in one image, learned from a tape found in it.
+
+A class of colour says little of an image: a green tape on a light floor is above all darker. What
+the chromaticity has found of the tapes shows it, and then the rest is found by it, even where
+compression has left no colour of a thin tape.
+"""
+
+from __future__ import annotations
+
+import cv2
+from nccs_pose.geometry.pose import Array
+from nccs_pose.vision.segment import Mask
+import numpy as np
+from numpy.typing import NDArray
+
+# One pixel out of so many tells how the floor varies, without those this near a tape and without
+# the most extreme of the others, which are things and not floor.
+_SPARSE = 3
+_NEAR = np.ones((9, 9), np.uint8)
+_ORDINARY = 90.0
+# Rounding and compression, grey levels^2.
+_ROUNDING = 4.0
+
+
+def learned_weights(
+    image: NDArray[np.uint8], tape: tuple[NDArray[np.intp], NDArray[np.intp]], floor: Mask,
+    window: int,
+) -> Array | None:
+    """Fisher's weights (3,) on B, G, R for tape against floor; None where no floor is left.
+
+    :param image: (H, W, 3) uint8 BGR.
+    :param tape: rows and columns (N,) of pixels on tapes.
+    :param floor: (H, W), not 0 where there is floor.
+    :param window: width of the surroundings, px.
+    """
+    values = image.astype(np.float32)
+    values -= cv2.blur(values, (window, window))
+    on_tape = np.zeros(floor.shape, np.uint8)
+    on_tape[tape] = 255
+    beside = cv2.bitwise_and(floor, cv2.bitwise_not(cv2.dilate(on_tape, _NEAR)))
+    clutter = values[::_SPARSE, ::_SPARSE][beside[::_SPARSE, ::_SPARSE] > 0].astype(float)
+    if len(clutter) == 0:
+        return None
+    size = np.square(clutter).sum(axis=1)
+    clutter = clutter[size <= np.percentile(size, _ORDINARY)]
+    weights = np.linalg.solve(
+        clutter.T @ clutter / len(clutter) + _ROUNDING * np.eye(3),
+        values[tape].mean(axis=0).astype(float))
+    return np.asarray(2.0 * weights / max(float(np.abs(weights).sum()), 1e-9))
+
+
+def weighted(image: NDArray[np.uint8], weights: Array) -> Mask:
+    """The weighted sum of channels (H, W) uint8, 128 where the floor is as usual."""
+    usual = np.median(image[::8, ::8].reshape(-1, 3), axis=0)
+    return np.asarray(cv2.transform(
+        image, np.append(weights, 128.0 - weights @ usual)[None].astype(np.float32)))

@@ -1,0 +1,116 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Smaller images of the floor, and tapes found by what others of them look like."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import ideal_scene
+from nccs_pose.vision.learned_contrast import learned_weights, weighted
+from nccs_pose.vision.reduced import ReducedView
+import numpy as np
+import pytest
+
+REGION = np.zeros((101, 150), np.uint8)
+REGION[13:90, 22:141] = 255
+
+
+@pytest.mark.parametrize('pitch', [1, 2, 4])
+def test_a_view_holds_the_means_of_its_pixels(pitch: int) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (101, 150, 3), dtype=np.uint8)
+    view = ReducedView.of(REGION, pitch)
+    rows, columns = np.nonzero(view.region)
+    got = view.read(image)
+    assert got.shape[:2] == view.region.shape
+    top, left = view.rows.start + pitch * rows, view.columns.start + pitch * columns
+    # All that they are means of is floor, and all that could be is there.
+    blocks = [(top + i, left + j) for i in range(pitch) for j in range(pitch)]
+    assert all((REGION[block] == 255).all() for block in blocks)
+    assert len(rows) >= (77 // pitch - 1) * (119 // pitch - 1)
+    means = np.mean([image[block] for block in blocks], axis=0)
+    # Each halving rounds.
+    assert np.abs(got[rows, columns] - means).max() <= 1.0
+
+
+@pytest.mark.parametrize('pitch', [1, 2, 4])
+def test_blobs_of_a_view_are_in_pixels_of_the_image(pitch: int) -> None:
+    view = ReducedView.of(REGION, pitch)
+    mask = np.zeros_like(view.region)
+    mask[5:7, 4:16] = 255
+    found = view.blobs(mask, 400)
+    assert found.pitch == pitch
+    # The blob as it is in the image: its area, and its middle.
+    assert found.weight.sum() == 24 * pitch**2
+    whole = np.kron(mask, np.ones((pitch, pitch), np.uint8))
+    v, u = np.nonzero(whole)
+    middle = [view.columns.start + u.mean(), view.rows.start + v.mean()]
+    np.testing.assert_allclose(found.weight @ found.pixels / found.weight.sum(), middle)
+    rows, columns = view.places(found.pixels)
+    assert (mask[rows, columns] == 255).all() and len(set(zip(rows, columns))) == 24
+
+
+def test_what_is_no_floor_has_no_blobs() -> None:
+    view = ReducedView.of(REGION, 2)
+    assert len(view.blobs(~view.region, 400).pixels) == 0
+
+
+def test_weights_are_learned_that_part_tape_from_clutter() -> None:
+    """The floor varies in brightness, the tape differs in red: the weights look for red alone."""
+    rng = np.random.default_rng(1)
+    shade = 12.0 * rng.standard_normal((120, 160, 1))
+    image = np.clip(np.rint(140.0 + shade + rng.standard_normal((120, 160, 3))), 0, 255)
+    image[60:62, 20:120, 2] += 25.0
+    image[60:62, 20:120, :2] -= 5.0
+    image = image.astype(np.uint8)
+    tape = np.nonzero(np.pad(np.ones((2, 50), np.intp), ((60, 58), (20, 90))))
+    weights = learned_weights(image, tape, np.full((120, 160), 255, np.uint8), 15)
+    assert weights is not None
+    assert abs(weights.sum()) < 0.1 * np.abs(weights).max()
+    assert weights[2] > 0.0
+    feature = weighted(image, weights).astype(float)
+    # The half of the tape that was not shown stands out of the floor as the other does.
+    other, floor = feature[60:62, 80:120], feature[:50]
+    assert other.mean() - floor.mean() > 5.0 * floor.std()
+
+
+def test_without_any_floor_beside_the_tape_nothing_is_learned() -> None:
+    image = np.full((30, 30, 3), 100, np.uint8)
+    tape = (np.arange(30), np.arange(30))
+    assert learned_weights(image, tape, np.zeros((30, 30), np.uint8), 15) is None
+
+
+@pytest.mark.parametrize(('quality', 'least'), [(50, 7), (20, 4)])
+def test_a_first_pose_is_found_in_coarse_jpegs(quality: int, least: int) -> None:
+    """Chroma of half the size, quantised until thin tapes have next to none."""
+    scene = ideal_scene(640, 0.02)
+    scene = dataclasses.replace(
+        scene, sensor=dataclasses.replace(scene.sensor, jpeg_quality=quality))
+    localiser = Localiser(scene.rig, scene.line_map)
+    found = 0
+    for k in range(10):
+        rng = np.random.default_rng([21, k])
+        pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
+        localiser.reset()
+        estimate = localiser.process(0, render(scene, pose, rng))
+        if estimate.pose is None:
+            continue
+        found += 1
+        assert np.hypot(estimate.pose.x - pose.x, estimate.pose.y - pose.y) < 0.03
+        assert abs(wrap_angle(estimate.pose.yaw - pose.yaw)) < 0.01
+    assert found >= least
