@@ -33,15 +33,18 @@ from rclpy.node import Node
 from rclpy.qos import qos_policy_name_from_kind
 from sensor_msgs.msg import CompressedImage, Image
 
+BACKLOG = 5
+"""So many times in a row another image waited: that is no hiccup."""
 OnFrame = Callable[[int, str, 'NDArray[np.uint8]'], None]
 
 
 class ImageStream:
     """Subscribes images and hands on each that can be decoded.
 
-    An image that waits is late. One that waits after a hiccup is caught up with; where one waits
-    behind every image that is taken, the machine is too slow, and the older of the two is let go.
-    A depth that the user chose is taken at its word: all that it keeps are used.
+    An image that waits is late. After a hiccup those that wait are caught up with; where one
+    waits behind every image that is taken (BACKLOG), the machine is too slow, and the older of
+    the two is let go. A depth that the user chose is taken at its word: all that it keeps are
+    used.
 
     Missing images are counted by the publisher's sequence numbers; what of them the middleware
     reports as lost was lost on the way, the rest was let go because the node was busy.
@@ -68,7 +71,7 @@ class ImageStream:
         self._tally = tally
         self._on_frame = on_frame
         self._sequence: int | None = None
-        self._behind = False
+        self._behind = 0
         self._incompatible = ''
         self._on_publishers = on_publishers
         self.publishers = 0
@@ -110,9 +113,9 @@ class ImageStream:
 
     def _receive(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
         taken = [(message, info), *waiting(self._subscription, self._waiting)]
-        again, self._behind = self._behind, len(taken) > 1
+        self._behind = self._behind + 1 if len(taken) > 1 else 0
         # What is let go leaves a gap in the sequence numbers, as what the middleware replaces.
-        for each in taken[-1:] if again else taken:
+        for each in taken if self._behind < BACKLOG else taken[-1:]:
             self._use(*each)
 
     def _use(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:

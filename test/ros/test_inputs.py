@@ -132,7 +132,7 @@ def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
     # Now two images come in the time that one takes.
     def slow(stamp: int, image: Any) -> Any:
         used.append(stamp // 10_000_000)
-        if sent[-1] < 11:
+        if sent[-1] < 23:
             sent.extend((sent[-1] + 1, sent[-1] + 2))
             deliver(images, *map(black, sent[-2:]))
         return process(stamp, image)
@@ -140,11 +140,11 @@ def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
     sent = [4, 5]
     monkeypatch.setattr(localiser, 'process', slow)
     deliver(images, *map(black, sent))
-    pair.wait(lambda: used[-1] == 11)
-    # 4 and 5 as before; meanwhile 8 and 9 replaced 6 and 7 in the middleware; from then on
-    # the older of two is let go.
-    assert used[3:] == [4, 5, 9, 11]
-    assert (tally.received, tally.let_go) == (7, 4)
+    pair.wait(lambda: used[-1] == 23)
+    # While 4 and 5 are used, 8 and 9 replace 6 and 7 in the middleware, and so on; when one
+    # waits for the fifth time in a row, the older of the two is let go.
+    assert used[3:] == [4, 5, 8, 9, 12, 13, 16, 17, 21, 23]
+    assert (tally.received, tally.let_go) == (13, 10)
 
 
 @pytest.mark.parametrize(
