@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 
 from hypothesis import given
@@ -23,11 +24,12 @@ from hypothesis import strategies as st
 from labelled_scene import observe, pose_error, random_scene
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.closed_form import circle_minima, horizontal_minima, vertical_minima
-from nccs_pose.estimation.global_pose import solve
+from nccs_pose.estimation.global_pose import best_pose, solve
 from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.pose_monomials import gram, monomial_rows, monomials, monomials_jacobian
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import side
+from nccs_pose.estimation.small_matrices import inverse_2x2, inverse_3x3, solve_3x3
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.rig import Rays
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -130,7 +132,7 @@ def test_floor_minima_against_brute_force(name, noise):
     scene = random_scene(TABLE_ONE[name], FLOOR, count=8, noise=noise, rng=rng)
     rays, directions, moments = scene.by_ray
     rows = monomial_rows(rays.direction, rays.moment, directions, moments)[rays.hit]
-    assert_same_minima(horizontal_minima(gram(rows, np.ones(len(rows)))), rows)
+    assert_same_minima(horizontal_minima(gram(rows.T, 1.0)), rows)
 
 
 @pytest.mark.parametrize('name', RIGS)
@@ -139,7 +141,7 @@ def test_vertical_minima_against_brute_force(name):
     scene = random_scene(TABLE_ONE[name], ('vertical',) * 4, count=8, noise=3.0, rng=rng)
     rays, directions, moments = scene.by_ray
     rows = monomial_rows(rays.direction, rays.moment, directions, moments)
-    assert_same_minima(vertical_minima(gram(rows, np.ones(len(rows)))), rows)
+    assert_same_minima(vertical_minima(gram(rows.T, 1.0)), rows)
 
 
 @pytest.mark.parametrize('name', RIGS)
@@ -311,7 +313,66 @@ def bad_inputs():
     return [pytest.param(good | change, words, id=words) for words, change in changes.items()]
 
 
+@pytest.mark.parametrize('estimator', [solve, best_pose])
 @pytest.mark.parametrize(('arguments', 'words'), bad_inputs())
-def test_bad_input_is_named(arguments, words):
+def test_bad_input_is_named(arguments, words, estimator):
     with pytest.raises(EstimationError, match=words):
-        solve(**arguments)
+        estimator(**arguments)
+
+
+@pytest.mark.parametrize('derivatives', [False, True])
+@pytest.mark.parametrize('part', ['direction', 'moment'])
+def test_every_part_of_a_ray_is_checked(part, derivatives):
+    scene = random_scene(TABLE_ONE['spherical'], FLOOR, rng=np.random.default_rng(11))
+    field = f'{part}_jacobian' if derivatives else part
+    values = getattr(scene.rays, field).copy()
+    values[9, 2] = np.inf
+    rays = replace(scene.rays, **{field: values})
+    name = f'derivatives of ray {part}s' if derivatives else f'ray {part}s'
+    for estimator in (solve, best_pose):
+        with pytest.raises(EstimationError, match=f'^{name}: row 9 is not finite'):
+            estimator(rays, scene.directions, scene.moments, scene.label)
+
+
+@pytest.mark.parametrize('kinds', [
+    FLOOR, ('vertical',) * 4, ('slanted',) * 5, ('floor', 'floor', 'vertical', 'slanted')])
+@pytest.mark.parametrize('name', RIGS)
+def test_the_best_pose_alone_is_the_best_of_all(name, kinds):
+    """Other ways to the same minimum: all of them by eigenvalues, then a step on the rows."""
+    rng = np.random.default_rng(12)
+    for _ in range(10):
+        scene = random_scene(TABLE_ONE[name], kinds, noise=1.0, rng=rng)
+        arguments = scene.rays, scene.directions, scene.moments, scene.label
+        sigma = rng.uniform(0.5, 2.0, len(scene.label))
+        pose, covariance = best_pose(*arguments, sigma=sigma, sigma_world=0.01)
+        expected = solve(*arguments, sigma=sigma, sigma_world=0.01)[0]
+        assert np.abs(pose_error(pose, expected.pose)).max() < 1e-7
+        assert covariance == pytest.approx(expected.covariance, rel=1e-5, abs=1e-12)
+
+
+def test_the_best_pose_alone_must_be_fixed():
+    lines = np.array([[0.0, 0.8, 0.0], [0.1, -0.7, 0.0]]), np.array([[1.0, 0.3, 0.0]] * 2)
+    scene = observe(
+        TABLE_ONE['spherical'], Pose2(0.1, 0.1, 0.4), *lines, rng=np.random.default_rng(13))
+    with pytest.raises(EstimationError, match='open'):
+        best_pose(scene.rays, scene.directions, scene.moments, scene.label)
+
+
+@given(st.floats(0.1, 10.0), st.integers(0, 1000))
+def test_small_matrices_against_lapack(scale, seed):
+    rows = np.random.default_rng(seed).standard_normal((6, 3)) * [1.0, scale, scale**2]
+    m, g = rows.T @ rows, rows[0]
+    inverse = np.linalg.inv(m)
+    assert inverse_3x3(m) == pytest.approx(inverse, rel=1e-6, abs=1e-9 * inverse.max())
+    solved = solve_3x3(m[0, 0], m[0, 1], m[1, 1], m[0, 2], m[1, 2], m[2, 2], *g)
+    assert solved == pytest.approx(np.linalg.solve(m, g), rel=1e-6, abs=1e-9)
+    a, b, d = inverse_2x2(m[0, 0], m[0, 1], m[1, 1])
+    assert np.array([[a, b], [b, d]]) == pytest.approx(np.linalg.inv(m[:2, :2]), rel=1e-6)
+    # Of too few rows nothing is left but rounding; the two by two has its pseudo-inverse then.
+    flat = rows[:2].T @ rows[:2]
+    assert inverse_3x3(flat) is None
+    assert solve_3x3(
+        flat[0, 0], flat[0, 1], flat[1, 1], flat[0, 2], flat[1, 2], flat[2, 2], *g) is None
+    line = np.outer(rows[0, :2], rows[0, :2])
+    a, b, d = inverse_2x2(line[0, 0], line[0, 1], line[1, 1])
+    assert np.array([[a, b], [b, d]]) == pytest.approx(np.linalg.pinv(line), rel=1e-6)

@@ -22,8 +22,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from labelled_scene import pose_error, random_direction, random_scene
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.general_lines import general_minima
-from nccs_pose.estimation.global_pose import solve
+from nccs_pose.estimation.general_lines import all_minima, general_minima
+from nccs_pose.estimation.global_minimum import (
+    coefficients,
+    global_minimum,
+    is_global,
+    proved_minimum,
+)
+from nccs_pose.estimation.global_pose import best_pose, solve
+from nccs_pose.estimation.local_minimum import minimum_near
 from nccs_pose.estimation.pose_monomials import gram, monomial_rows, monomials
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import side, whitened_residual
@@ -37,6 +44,7 @@ from scipy.optimize import least_squares
 RIGS = sorted(TABLE_ONE)
 GENERAL = ('slanted',) * 5
 MIXED = ('floor', 'floor', 'vertical', 'slanted', 'slanted')
+SLANTED = np.array([[0.6, 0.0, 0.8]])
 # Median of chi-square with 3 degrees of freedom.
 MEDIAN_NEES = 2.366
 
@@ -78,7 +86,7 @@ def test_all_minima_against_a_grid_and_scipy(name, kinds, noise):
         TABLE_ONE[name], kinds, count=6, noise=noise, rng=np.random.default_rng(1))
     rays, directions, moments = scene.by_ray
     rows = monomial_rows(rays.direction, rays.moment, directions, moments)[rays.hit]
-    minima, expected = general_minima(gram(rows, np.ones(len(rows)))), brute_force(rows)
+    minima, expected = general_minima(gram(rows.T, 1.0)), brute_force(rows)
     assert len(minima) == len(expected)
     for minimum, (cost, pose) in zip(minima, expected):
         assert np.abs(pose_error(minimum.pose, pose)).max() < 1e-5
@@ -94,7 +102,7 @@ def test_any_gram_matrix(seed):
         rows = rng.standard_normal((rng.integers(4, 20), 7)) * 10.0 ** rng.uniform(-1, 1, 7)
         cost, _ = best_at(rows, np.linspace(-math.pi, math.pi, 1000, endpoint=False))
         valleys = np.count_nonzero((cost < np.roll(cost, 1)) & (cost <= np.roll(cost, -1)))
-        minima = general_minima(gram(rows, np.ones(len(rows))))
+        minima = general_minima(gram(rows.T, 1.0))
         assert len(minima) == valleys
         assert minima[0].cost <= cost.min() * (1.0 + 1e-9)
         exact, translation = best_at(rows, [minima[0].pose.yaw])
@@ -102,6 +110,72 @@ def test_any_gram_matrix(seed):
         assert minima[0].pose.translation[:2] == pytest.approx(translation[0], rel=1e-6)
         several += valleys > 1
     assert several
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_what_is_proved_to_be_the_global_minimum_is(seed):
+    """Forms made at random: nothing better on a dense grid, and no other minimum is proved."""
+    rng = np.random.default_rng(seed)
+    proved = refuted = 0
+    for _ in range(20):
+        rows = rng.standard_normal((rng.integers(4, 20), 7)) * 10.0 ** rng.uniform(-1, 1, 7)
+        gram_matrix = gram(rows.T, 1.0)
+        cost, _ = best_at(rows, np.linspace(-math.pi, math.pi, 180, endpoint=False))
+        found = proved_minimum(gram_matrix)
+        if found is not None:
+            proved += 1
+            assert found.cost <= cost.min() * (1.0 + 1e-9)
+            exact, translation = best_at(rows, [found.pose.yaw])
+            assert found.cost == pytest.approx(exact[0], rel=1e-6)
+            assert found.pose.translation[:2] == pytest.approx(translation[0], rel=1e-6)
+        best, *others = general_minima(gram_matrix)
+        assert global_minimum(gram_matrix, SLANTED).cost == pytest.approx(best.cost, rel=1e-6)
+        assert not any(is_global(coefficients(gram_matrix), m.pose.yaw) for m in others)
+        refuted += len(others)
+    assert proved and refuted
+
+
+@pytest.mark.parametrize('name', RIGS)
+def test_the_minimum_that_lines_make_is_mostly_proved(name):
+    """That is what makes it quick: else all minima are found."""
+    rng, proved = np.random.default_rng(11), 0
+    for _ in range(20):
+        scene = random_scene(TABLE_ONE[name], GENERAL, noise=1.0, rng=rng)
+        rays, directions, moments = scene.by_ray
+        rows = monomial_rows(rays.direction, rays.moment, directions, moments).T
+        proved += proved_minimum(gram(rows, 1.0)) is not None
+    assert proved >= 16
+
+
+def test_a_twin_is_not_proved_to_be_the_only_one():
+    """The same form seen after half a turn about (0.4, -0.3), added to itself."""
+    rng = np.random.default_rng(1)
+    rows = rng.standard_normal((20, 7))
+    # c, s, x, y, p, q, 1 of the pose turned: (-c, -s, 0.8 - x, -0.6 - y, p', q', 1), and p' =
+    # -c (0.8 - x) - s (-0.6 - y), q' = -c (-0.6 - y) + s (0.8 - x).
+    turn = np.diag([-1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    turn[2, 6], turn[3, 6] = 0.8, -0.6
+    turn[4, :2], turn[5, :2] = (-0.8, 0.6), (0.6, 0.8)
+    both = np.concatenate([rows, rows @ turn])
+    minima = general_minima(gram(both.T, 1.0))
+    assert minima[0].cost == pytest.approx(minima[1].cost)
+    assert proved_minimum(gram(both.T, 1.0)) is None
+    assert global_minimum(gram(both.T, 1.0), SLANTED).cost == pytest.approx(minima[0].cost)
+
+
+@pytest.mark.parametrize('kinds', [GENERAL, MIXED, ('floor',) * 4, ('vertical',) * 4])
+def test_a_minimum_follows_the_weights(kinds):
+    """Newton's method from the old minimum against all minima found anew."""
+    scene = random_scene(TABLE_ONE['parabolic'], kinds, noise=3.0, rng=np.random.default_rng(9))
+    rays, directions, moments = scene.by_ray
+    rows = monomial_rows(rays.direction, rays.moment, directions, moments).T
+    old = all_minima(gram(rows, 1.0), scene.directions)[0]
+    weighted = gram(rows, np.random.default_rng(10).uniform(0.2, 5.0, rows.shape[1]))
+    new = minimum_near(weighted, scene.directions, old.pose)
+    expected = all_minima(weighted, scene.directions)[0]
+    assert 1e-5 < np.abs(pose_error(new.pose, old.pose)).max() < 0.1
+    assert np.abs(pose_error(new.pose, expected.pose)).max() < 1e-7
+    assert new.cost == pytest.approx(expected.cost, rel=1e-6)
 
 
 @pytest.mark.parametrize('kinds', [GENERAL, MIXED], ids=['slanted', 'mixed'])
@@ -208,8 +282,9 @@ def test_rays_that_point_away_are_refused(kinds):
         found = solve(reversed_, scene.directions, scene.moments, scene.label)
         assert abs(math.remainder(found[0].pose.yaw - scene.pose.yaw, 2 * math.pi)) > 3.0
     else:
-        with pytest.raises(EstimationError, match='behind the mirror'):
-            solve(reversed_, scene.directions, scene.moments, scene.label)
+        for estimator in (solve, best_pose):
+            with pytest.raises(EstimationError, match='behind the mirror'):
+                estimator(reversed_, scene.directions, scene.moments, scene.label)
 
 
 @given(

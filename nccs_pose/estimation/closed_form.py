@@ -31,11 +31,8 @@ from __future__ import annotations
 import math
 
 from nccs_pose.estimation.pose_monomials import Minimum
+from nccs_pose.estimation.small_matrices import inverse_2x2, ROUNDING
 from nccs_pose.geometry.pose import Array, Pose2
-import numpy as np
-
-# Relative size below which a pivot of a Gram matrix is nothing but rounding.
-ROUNDING = 1e-12
 
 
 def horizontal_minima(gram: Array) -> tuple[Minimum, ...]:
@@ -68,28 +65,26 @@ def _eliminate(gram: Array, first: int) -> list[tuple[float, float, float, float
 
     :param first: index of t_1 among the monomials.
     """
-    turn = np.array([0, 1, 6])
-    block = gram[first:first + 2, first:first + 2]
+    (c0, s0, _, _, _, _, k0), (_, s1, _, _, _, _, k1) = gram[0].tolist(), gram[1].tolist()
+    k6 = float(gram[6, 6])
+    upper, lower = gram[first].tolist(), gram[first + 1].tolist()
+    a, b, d = inverse_2x2(upper[first], upper[first + 1], lower[first + 1])
     # Translation that goes with each of c, s, 1.
-    follow = -inverse_2x2(block) @ gram[first:first + 2][:, turn]
-    reduced = gram[turn][:, turn] + gram[turn][:, first:first + 2] @ follow
-    scale = max(gram[0, 0], gram[1, 1], gram[6, 6])
-    (h00, h01, g0), (_, h11, g1), (_, _, k) = reduced.tolist()
+    u, v = (upper[0], upper[1], upper[6]), (lower[0], lower[1], lower[6])
+    t1 = [-a * p - b * q for p, q in zip(u, v)]
+    t2 = [-b * p - d * q for p, q in zip(u, v)]
+    h00 = c0 + u[0] * t1[0] + v[0] * t2[0]
+    h01 = s0 + u[0] * t1[1] + v[0] * t2[1]
+    h11 = s1 + u[1] * t1[1] + v[1] * t2[1]
+    g0 = k0 + u[0] * t1[2] + v[0] * t2[2]
+    g1 = k1 + u[1] * t1[2] + v[1] * t2[2]
+    k = k6 + u[2] * t1[2] + v[2] * t2[2]
     found = []
-    for c, s in circle_minima(h00, h01, h11, g0, g1, ROUNDING * scale):
+    for c, s in circle_minima(h00, h01, h11, g0, g1, ROUNDING * max(c0, s1, k6)):
         cost = h00 * c * c + 2.0 * h01 * c * s + h11 * s * s + 2.0 * (g0 * c + g1 * s) + k
-        t1, t2 = (follow @ (c, s, 1.0)).tolist()
-        found.append((c, s, t1, t2, cost))
+        found.append((
+            c, s, t1[0] * c + t1[1] * s + t1[2], t2[0] * c + t2[1] * s + t2[2], cost))
     return found
-
-
-def inverse_2x2(matrix: Array) -> Array:
-    """Inverse of a symmetric, non-negative matrix (2, 2); its pseudo-inverse where singular."""
-    (a, b), (_, d) = matrix.tolist()
-    determinant, trace = a * d - b * b, a + d
-    if determinant > ROUNDING * trace * trace:
-        return np.array([[d, -b], [-b, a]]) / determinant
-    return matrix / (trace * trace) if trace > 0.0 else np.zeros((2, 2))
 
 
 def circle_minima(

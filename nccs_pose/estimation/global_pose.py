@@ -26,8 +26,10 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.general_lines import ALIGNED, all_minima, minimum_near
+from nccs_pose.estimation.general_lines import ALIGNED, all_minima
+from nccs_pose.estimation.global_minimum import global_minimum
 from nccs_pose.estimation.labelled_rays import LabelledRays
+from nccs_pose.estimation.local_minimum import minimum_near
 from nccs_pose.estimation.observability import (
     Symmetry,
     symmetry,
@@ -35,6 +37,7 @@ from nccs_pose.estimation.observability import (
     unobserved_directions,
 )
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
+from nccs_pose.estimation.small_matrices import inverse_3x3
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -97,16 +100,42 @@ def solve(
         no line's, or when every pose that fits has its lines behind the mirror.
     """
     data = LabelledRays(rays, directions, moments, label, sigma, sigma_world)
-    found: list[_Found] = []
-    for start in all_minima(gram(data.rows, 1.0 / data.sigma2), data.directions):
-        if found and _chi2(data, start.pose) > _HOPELESS * _limit(found, len(data)):
-            continue
-        solution = _weighted(data, start.pose)
-        if not any(_same(solution, other) for other in found):
-            found.append(solution)
-    found = _equally_good(found, len(data))
     lines = symmetry(data.directions, data.moments).shifted(data.origin)
-    return tuple(_solution(data, entry, lines) for entry in found)
+    return tuple(_solution(data, entry, lines) for entry in _poses(data))
+
+
+def best_pose(
+    rays: Rays,
+    directions: ArrayLike,
+    moments: ArrayLike,
+    label: ArrayLike,
+    *,
+    sigma: ArrayLike = 1.0,
+    sigma_world: float = 0.0,
+) -> tuple[Pose2, Array]:
+    """The best pose and its covariance (3, 3), for lines that are known to fix one.
+
+    The closed form, weighted by the variances at its pose and solved once more: the first of
+    :func:`solve`, without a look for others that are as good. Parameters are those of it.
+
+    :raises EstimationError: as :func:`solve` does, and where the rays leave a direction of the
+        pose open.
+    """
+    data = LabelledRays(rays, directions, moments, label, sigma, sigma_world)
+    first = global_minimum(gram(data.rows, 1.0 / data.sigma2), data.directions).pose
+    weighted = gram(data.rows, 1.0 / data.variance(first))
+    pose = minimum_near(weighted, data.directions, first).pose
+    slopes = monomials_jacobian(pose).T
+    information = slopes @ weighted @ slopes.T
+    if data.in_front(pose) < 1.0 - _VIRTUAL:
+        # Another pose may have more lines in front.
+        best = _poses(data)[0]
+        pose, information = best.pose, best.information
+    covariance = inverse_3x3(information)
+    if covariance is None:
+        raise EstimationError('the rays leave a direction of the pose open: no covariance')
+    x, y = data.origin.tolist()
+    return Pose2(pose.x + x, pose.y + y, pose.yaw), covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +146,18 @@ class _Found:
     chi2: float
     information: Array
     in_front: float
+
+
+def _poses(data: LabelledRays) -> list[_Found]:
+    """All poses that are equally good, best first."""
+    found: list[_Found] = []
+    for start in all_minima(gram(data.rows, 1.0 / data.sigma2), data.directions):
+        if found and _chi2(data, start.pose) > _HOPELESS * _limit(found, len(data)):
+            continue
+        solution = _weighted(data, start.pose)
+        if not any(_same(solution, other) for other in found):
+            found.append(solution)
+    return _equally_good(found, len(data))
 
 
 def _equally_good(found: list[_Found], n_rays: int) -> list[_Found]:
@@ -142,7 +183,7 @@ def _limit(found: list[_Found], n_rays: int) -> float:
 
 
 def _chi2(data: LabelledRays, pose: Pose2) -> float:
-    s = data.rows @ monomials(pose)
+    s = monomials(pose) @ data.rows
     return float((s * s / data.variance(pose)).sum())
 
 
@@ -154,7 +195,7 @@ def _weighted(data: LabelledRays, pose: Pose2) -> _Found:
     for _ in range(_REWEIGHTINGS):
         weights = 1.0 / data.variance(pose)
         before = pose
-        pose = minimum_near(gram(data.rows, weights), data.directions, pose.yaw).pose
+        pose = minimum_near(gram(data.rows, weights), data.directions, pose).pose
         if abs(_difference(pose.yaw, before.yaw)) < _CLOSE_START:
             break
     return _polished(data, weights, pose)
@@ -162,16 +203,16 @@ def _weighted(data: LabelledRays, pose: Pose2) -> _Found:
 
 def _polished(data: LabelledRays, weights: Array, pose: Pose2) -> _Found:
     """One Gauss-Newton step on the rows, which the Gram matrix knows to half their digits."""
-    jacobian = data.rows @ monomials_jacobian(pose)
-    weighted = jacobian * weights[:, None]
-    information = weighted.T @ jacobian
+    jacobian = monomials_jacobian(pose).T @ data.rows
+    weighted = jacobian * weights
+    information = weighted @ jacobian.T
     values, vectors = np.linalg.eigh(information)
     # Where the rays say nothing the pose stays.
     heard = values > 1e-12 * values[-1]
-    slope = vectors.T @ (weighted.T @ (data.rows @ monomials(pose)))
+    slope = vectors.T @ (weighted @ (monomials(pose) @ data.rows))
     step = vectors[:, heard] @ (slope[heard] / values[heard])
     pose = Pose2.from_array(pose.as_array() - step)
-    s = data.rows @ monomials(pose)
+    s = monomials(pose) @ data.rows
     return _Found(pose, float(weights @ (s * s)), information, data.in_front(pose))
 
 

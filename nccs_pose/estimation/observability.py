@@ -32,9 +32,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from nccs_pose.estimation.closed_form import inverse_2x2
 from nccs_pose.estimation.general_lines import ALIGNED
 from nccs_pose.estimation.pose_monomials import feet_in_plan
+from nccs_pose.estimation.small_matrices import inverse_2x2
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 
@@ -108,7 +108,10 @@ def symmetry(directions: Array, moments: Array) -> Symmetry:
         return Symmetry('one line', sliding=d[0], half_turn=q[0])
     # The point nearest to all of them, by least squares on their normals (-d_y, d_x).
     normals = np.stack([-d[:, 1], d[:, 0]], axis=1)
-    point = inverse_2x2(normals.T @ normals) @ (normals.T @ (normals * q).sum(axis=1))
+    (xx, xy), (_, yy) = (normals.T @ normals).tolist()
+    x, y = (normals.T @ (normals * q).sum(axis=1)).tolist()
+    a, b, c = inverse_2x2(xx, xy, yy)
+    point = np.array([a * x + b * y, b * x + c * y])
     if np.abs(_offsets(d, q, point)).max() > COINCIDENT:
         return Symmetry()
     words = 'two lines that meet' if len(d) == 2 else 'concurrent lines'

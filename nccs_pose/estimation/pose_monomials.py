@@ -31,7 +31,9 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.rig import Rays
 import numpy as np
+from numpy.typing import NDArray
 
 # Rows and columns of the Gram matrix.
 MONOMIALS = ('c', 's', 'x', 'y', 'p', 'q', '1')
@@ -49,35 +51,72 @@ class Minimum:
     cost: float
 
 
-def monomial_rows(ray: Array, ray_moment: Array, directions: Array, moments: Array) -> Array:
-    """Coefficients of S (N, 7) of N rays against the N lines that they should meet.
+def _per_line() -> Array:
+    """What S needs of a line, as a matrix (14, 6) on (d, mu): see :func:`forms`."""
+    d_x, d_y, d_z, mu_x, mu_y, mu_z = np.eye(6)
+    return np.array([
+        mu_x, mu_y, mu_z, d_x, d_y, d_z, mu_y, -mu_x, d_y, -d_x, -d_y, d_x, d_z, -d_z])
 
-    They are linear in the ray: with its derivatives by the pixel in its place they are those of
-    the derivatives of S, (2, N, 7).
+
+_PER_LINE = _per_line()
+
+
+def forms(rays: Array, lines: Array, index: NDArray[np.intp] | None = None) -> Array:
+    """Coefficients of S (7, K, N) of K times N rays, each N against their lines.
+
+    They are linear in the ray: with its derivative by the pixel in its place they are those of
+    the derivative of S.
+
+    :param rays: (r, w) of each ray, or of what stands in its place (6, K, N); w in metres.
+    :param lines: (d, mu) in the map (L, 6), with unit directions d; mu in metres.
+    :param index: the line of each ray (N,); None where there is a line for each, in order.
+    """
+    per_line = _PER_LINE @ lines.T
+    line = (per_line if index is None else per_line.take(index, axis=1))[:, None]
+    rows = np.empty((7, *rays.shape[1:]))
+    # r mu + w d, component by component: x and y belong to c, z to 1.
+    product = rays * line[:6]
+    product[:3] += product[3:]
+    np.add(product[0], product[1], out=rows[0])
+    rows[6] = product[2]
+    across = rays.reshape(2, 3, *rays.shape[1:])[:, :2] * line[6:10].reshape(2, 2, 1, -1)
+    across[0] += across[1]
+    np.add(across[0, 0], across[0, 1], out=rows[1])
+    np.multiply(rays[2], line[10:12], out=rows[2:4])
+    np.multiply(rays[1::-1], line[12:], out=rows[4:6])
+    return rows
+
+
+def monomial_rows(ray: Array, ray_moment: Array, directions: Array, moments: Array) -> Array:
+    """The same as rows: coefficients of S (N, 7) of N rays against N lines.
 
     :param ray: directions r (N, 3), or their derivatives (2, N, 3).
     :param ray_moment: moments w (N, 3), metres, or their derivatives (2, N, 3).
     :param directions: unit directions of the lines in the map (N, 3).
     :param moments: their moments (N, 3), metres.
     """
-    rx, ry, rz = ray[..., 0], ray[..., 1], ray[..., 2]
-    wx, wy, wz = ray_moment[..., 0], ray_moment[..., 1], ray_moment[..., 2]
-    dx, dy, dz = directions.T
-    mx, my, mz = moments.T
-    rows = np.empty((7, *rx.shape))
-    rows[0] = rx * mx + ry * my + wx * dx + wy * dy
-    rows[1] = rx * my - ry * mx + wx * dy - wy * dx
-    rows[2] = -rz * dy
-    rows[3] = rz * dx
-    rows[4] = ry * dz
-    rows[5] = -rx * dz
-    rows[6] = rz * mz + wz * dz
-    return rows.T if rows.ndim == 2 else rows.transpose(1, 2, 0)
+    rays = np.concatenate([ray, ray_moment], axis=-1).T
+    columns = rays.reshape(6, len(directions), -1).transpose(0, 2, 1)
+    rows = forms(columns, np.concatenate([directions, moments], axis=1))
+    return rows[:, 0].T if ray.ndim == 2 else rows.transpose(1, 2, 0)
 
 
-def gram(rows: Array, weights: Array) -> Array:
-    """Gram matrix (7, 7) of rows (N, 7) with a weight each (N,)."""
-    return (rows * weights[:, None]).T @ rows
+def with_derivatives(rays: Rays, more: int = 0) -> Array:
+    """(r, w) of N rays and its derivatives by u and v, (6, 3 + more, N).
+
+    :param more: places behind those that are left to be filled.
+    """
+    coordinates = np.empty((6, 3 + more, len(rays)))
+    coordinates[:3, 0] = rays.direction.T
+    coordinates[3:, 0] = rays.moment.T
+    coordinates[:3, 1:3] = rays.direction_jacobian.transpose(1, 2, 0)
+    coordinates[3:, 1:3] = rays.moment_jacobian.transpose(1, 2, 0)
+    return coordinates
+
+
+def gram(rows: Array, weights: Array | float) -> Array:
+    """Gram matrix (7, 7) of rows (7, N) with a weight each (N,), or one for all."""
+    return (rows * weights) @ rows.T
 
 
 def monomials(pose: Pose2) -> Array:

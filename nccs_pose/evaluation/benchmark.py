@@ -30,12 +30,9 @@ import time
 from typing import Any
 
 from nccs_pose.errors import OptionError
-from nccs_pose.estimation.general_lines import all_minima, minimum_near
-from nccs_pose.estimation.global_pose import solve
+from nccs_pose.estimation.global_pose import best_pose, solve
 from nccs_pose.estimation.image_refine import refine_in_image
-from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.paper import paper_estimate
-from nccs_pose.estimation.pose_monomials import gram, monomials_jacobian
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import whitened_residual
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
@@ -46,7 +43,7 @@ from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.reflection_curve import ReflectionCurve
-from nccs_pose.geometry.rig import Rays, Rig
+from nccs_pose.geometry.rig import Rig
 import numpy as np
 import scipy
 from scipy.optimize import least_squares
@@ -167,7 +164,7 @@ def _work(rig: Rig, data: DataSet) -> dict[str, Callable[[], Any]]:
         PAPER: lambda: paper_estimate(rig, data.pixels, d[label], mu[label], data.start),
         FULL: full,
         IMAGE: in_image,
-        CLOSED: lambda: _closed_form(rays, data),
+        CLOSED: lambda: best_pose(rays, d, mu, label),
         POSES: lambda: solve(rays, d, mu, label),
         PAPER_FREE: lambda: paper_estimate(
             rig, data.pixels, d[label], mu[label], data.start, use_g2=False),
@@ -177,16 +174,6 @@ def _work(rig: Rig, data: DataSet) -> dict[str, Callable[[], Any]]:
         CURVE: lambda: curve.gamma(y, z),
         TRACE: lambda: trace_line(rig, line),
     }
-
-
-def _closed_form(rays: Rays, data: DataSet) -> tuple[Pose2, np.ndarray]:
-    """The closed form, weighted and solved once more, and its covariance: nothing else."""
-    problem = LabelledRays(rays, data.directions, data.moments, data.label)
-    first = all_minima(gram(problem.rows, 1.0 / problem.sigma2), problem.directions)[0].pose
-    weights = 1.0 / problem.variance(first)
-    pose = minimum_near(gram(problem.rows, weights), problem.directions, first.yaw).pose
-    jacobian = problem.rows @ monomials_jacobian(pose)
-    return pose, np.linalg.inv((jacobian * weights[:, None]).T @ jacobian)
 
 
 def _difference(a: Pose2, b: np.ndarray) -> float:

@@ -1,0 +1,65 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Symmetric matrices of two and three rows, number by number: quicker than a call of LAPACK."""
+
+from __future__ import annotations
+
+from nccs_pose.geometry.pose import Array
+import numpy as np
+
+# Relative size below which a pivot of a Gram matrix is nothing but rounding.
+ROUNDING = 1e-12
+
+
+def inverse_2x2(a: float, b: float, d: float) -> tuple[float, float, float]:
+    """Inverse of [[a, b], [b, d]], as its entries, for a matrix that is nowhere negative.
+
+    The pseudo-inverse where it is singular.
+    """
+    determinant, trace = a * d - b * b, a + d
+    if determinant > ROUNDING * trace * trace:
+        return d / determinant, -b / determinant, a / determinant
+    if trace > 0.0:
+        return a / (trace * trace), b / (trace * trace), d / (trace * trace)
+    return 0.0, 0.0, 0.0
+
+
+def solve_3x3(
+    xx: float, xy: float, yy: float, xz: float, yz: float, zz: float,
+    gx: float, gy: float, gz: float,
+) -> tuple[float, float, float] | None:
+    """Solution of H v = g, with H positive definite beyond rounding; else None."""
+    minor, trace = xx * yy - xy * xy, xx + yy
+    if not minor > ROUNDING * trace * trace:
+        return None
+    ax, ay = (yy * xz - xy * yz) / minor, (xx * yz - xy * xz) / minor
+    bx, by = (yy * gx - xy * gy) / minor, (xx * gy - xy * gx) / minor
+    pivot = zz - xz * ax - yz * ay
+    if not pivot > ROUNDING * abs(zz):
+        return None
+    z = (gz - xz * bx - yz * by) / pivot
+    return bx - ax * z, by - ay * z, z
+
+
+def inverse_3x3(matrix: Array) -> Array | None:
+    """Inverse of a symmetric matrix (3, 3), positive definite beyond rounding; else None."""
+    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * p + b * q + c * r
+    if not determinant > ROUNDING * a * d * f:
+        return None
+    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+    return np.array([[p, q, r], [q, s, t], [r, t, u]]) / determinant
