@@ -69,46 +69,46 @@ def solve_shifts(
     :param calibration_sigma: what the calibration may shift the whole image by, px.
     """
     free, known, expected = _prior(start, prior, attitude_sigma)
-    jacobian = slide[:, free] / sigma[:, None]
-    right = shift / sigma
     vague = np.diag(_VAGUE[free])
     told = known @ expected
     known = known + vague
-    unknowns, scale = np.zeros(len(free)), 1.0
-    number = np.cumsum(np.diff(group, prepend=group[:1]) != 0)
-    e = right
+    rows = np.column_stack([slide[:, free], shift]) / sigma[:, None]
+    first = _first(group)
+    members = np.diff([*first, len(group)])
+    # Of each group: the products of its rows, and their sum as one whitened row.
+    products = np.add.reduceat(rows[:, :, None] * rows[:, None, :], first)
+    sums = np.add.reduceat(rows, first) / np.sqrt(members)[:, None]
+    unknowns: Array = np.zeros(len(free))
+    e: Array = sums[:, -1]
+    scale = 1.0
     for _ in range(_ITERATIONS):
-        common = pooled(e, group)
-        scale = _robust_scale(common)
-        weighted = jacobian / (1.0 + np.square(common / (_CAUCHY * scale)))[number, None]
-        normal = weighted.T @ jacobian + known
+        scale = _robust_scale(e)
+        normal, right = _normal(products, 1.0 / (1.0 + np.square(e / (_CAUCHY * scale))))
+        normal += known
         before = unknowns
-        unknowns = np.linalg.solve(normal, weighted.T @ right + told)
-        e = right - jacobian @ unknowns
+        unknowns = np.linalg.solve(normal, right + told)
+        e = sums[:, -1] - sums[:, :-1] @ unknowns
         step = unknowns - before
         if step @ normal @ step < 1e-2:
             break
-    common = pooled(e, group)
-    inlier = (np.abs(common) <= _GATE * _robust_scale(common))[number]
-    trusted = jacobian[inlier]
-    normal = trusted.T @ trusted
+    trusted = np.abs(e) <= _GATE * _robust_scale(e)
+    normal, right = _normal(products, trusted.astype(float))
     # The prior's share is weighed against residuals of the size that they have.
-    inflation = _inflation(e[inlier], group[inlier])
-    unknowns = np.linalg.solve(
-        normal / inflation + known, trusted.T @ right[inlier] / inflation + told)
-    e = right - jacobian @ unknowns
-    inflation = _inflation(e[inlier], group[inlier])
+    inflation = _inflation(e[trusted])
+    unknowns = np.linalg.solve(normal / inflation + known, right / inflation + told)
+    inflation = _inflation((sums[:, -1] - sums[:, :-1] @ unknowns)[trusted])
     covariance = np.linalg.inv(normal / inflation + known)
+    inlier = np.repeat(trusted, members)
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
-        answer = covariance @ (trusted.T @ moved) * (calibration_sigma / inflation)
+        answer = covariance @ (rows[inlier, :-1].T @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     attitude = np.zeros(3)
     attitude[np.array(free[3:], dtype=int) - 3] = unknowns[3:]
     return Refinement(
         Pose2(start.x + unknowns[0], start.y + unknowns[1], start.yaw + unknowns[2]),
-        0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude, e, inlier, scale,
-        True)
+        0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
+        rows[:, -1] - rows[:, :-1] @ unknowns, inlier, scale, True)
 
 
 def _prior(
@@ -129,14 +129,24 @@ def _prior(
 
 def pooled(e: Array, group: NDArray[np.intp]) -> Array:
     """Whitened residuals (N,) of groups of neighbours (N,), summed to whitened ones (G,)."""
-    first = np.flatnonzero(np.diff(group, prepend=-1))
+    first = _first(group)
     return np.add.reduceat(e, first) / np.sqrt(np.diff([*first, len(e)]))
 
 
-def _inflation(e: Array, group: NDArray[np.intp]) -> float:
-    """Variance of the inlying groups' residuals (N,) against the noise told."""
-    common = pooled(e, group)
-    return max(1e-6, float(common @ common) / (_WITHIN_GATE * max(1, len(common) - 3)))
+def _first(group: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The first member of each group (G,)."""
+    return np.concatenate([[0], np.flatnonzero(group[1:] != group[:-1]) + 1])
+
+
+def _normal(products: Array, weight: Array) -> tuple[Array, Array]:
+    """Normal matrix and right side of the groups' rows (G, K, K) under weights (G,)."""
+    weighed = (weight @ products.reshape(len(weight), -1)).reshape(products.shape[1:])
+    return weighed[:-1, :-1], weighed[:-1, -1]
+
+
+def _inflation(e: Array) -> float:
+    """Variance of the inlying groups' residuals (G,) against the noise told."""
+    return max(1e-6, float(e @ e) / (_WITHIN_GATE * max(1, len(e) - 3)))
 
 
 def _robust_scale(e: Array) -> float:

@@ -187,16 +187,16 @@ class _Groups:
     @classmethod
     def of(cls, bands: Bands) -> _Groups:
         """Parts of equal length of each line; the label ascends."""
-        n, cut = len(bands), np.flatnonzero(np.diff(bands.label)) + 1
-        begin = np.concatenate([[0], cut])
-        line = np.repeat(np.arange(len(begin)), np.diff([*begin, n]))
-        length = np.add.reduceat(bands.spacing, begin)
-        place = np.cumsum(bands.spacing) - 0.5 * bands.spacing - (np.cumsum(length) - length)[line]
-        parts = np.maximum(length // _SHARED_PX, 1.0)
-        part = (place * (parts / length)[line]).astype(int)
-        first = np.flatnonzero(np.diff(line, prepend=-1) | np.diff(part, prepend=-1))
+        n = len(bands)
+        begin = np.concatenate([[0], np.flatnonzero(bands.label[1:] != bands.label[:-1]) + 1])
+        count = np.diff([*begin, n])
+        # All stations of a line stand for pieces of the same length.
+        parts = np.clip(count * bands.spacing[begin] // _SHARED_PX, 1.0, count)
+        place = (np.arange(n) - np.repeat(begin, count)) * np.repeat(parts / count, count)
+        number = (place + np.repeat(np.cumsum(parts) - parts, count) + 1e-9).astype(np.intp)
+        first = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
         members = np.diff([*first, n])
-        return cls(first, members, np.repeat(np.arange(len(first)), members))
+        return cls(first, members, number)
 
 
 def fit_profiles(
