@@ -78,8 +78,8 @@ def solve_shifts(
     # Of each group: the products of its rows, and their sum as one whitened row.
     products = np.add.reduceat(rows[:, :, None] * rows[:, None, :], first)
     sums = np.add.reduceat(rows, first) / np.sqrt(members)[:, None]
-    unknowns, scale = np.zeros(len(free)), 1.0
-    e: Array = sums[:, -1]
+    unknowns: NDArray[np.floating] = np.zeros(len(free))
+    e, scale = sums[:, -1], 1.0
     for _ in range(_ITERATIONS):
         scale = _robust_scale(e)
         normal, right = _normal(products, 1.0 / (1.0 + np.square(e / (_CAUCHY * scale))))
