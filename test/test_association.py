@@ -22,6 +22,7 @@ import itertools
 from nccs_pose.estimation.association import (
     global_candidates,
     map_symmetries,
+    misfits,
     same_pose,
     score_pose,
 )
@@ -226,6 +227,29 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
         score, part = score_pose(pose @ step, strips, line_map, table)
         assert score < there - 0.3
         assert part < claimed
+
+
+def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -> None:
+    line_map = LineMap((_line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5))))
+    pose = Pose2(0.2, -0.1, 0.8)
+    strips = _strips(line_map, pose, np.random.default_rng(16), noise=0.0)
+    assert len(strips) == 2
+    strips = tuple(replace(strip, pitch=2) for strip in strips)
+    dx, dy = 0.02, -0.03
+    moved = Pose2(pose.x + dx, pose.y + dy, pose.yaw)
+    # The first map line is moved off by dy, the second by dx; a pixel of the image is half of one
+    # of those that the footprint is of.
+    square = sum(
+        s.weight * (off / (0.5 * s.footprint)) ** 2 for s in strips
+        for off in [dy if _lies_on(s, line_map[0], pose) < 0.01 else dx])
+    expected = np.sqrt(square / sum(s.weight for s in strips))
+    there, here, nowhere = misfits(
+        [pose, moved, Pose2(9.0, 9.0, 0.5)], strips, line_map, table)
+    assert there < 1e-6
+    assert here == pytest.approx(expected, rel=1e-6)
+    assert nowhere == np.inf
+    assert misfits([pose], (), line_map, table) == [np.inf]
+    assert misfits([], strips, line_map, table) == []
 
 
 # ---------------------------------------------------------------- symmetries of maps

@@ -21,6 +21,8 @@ explains the image, best first.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs
@@ -37,6 +39,7 @@ _CLOSE = 200
 _MANY = 400
 _COARSE = 4
 _REFINED = 24
+_ROUNDS = 2
 # Samples on each strip and on each map line.
 _SAMPLES = 12
 # Fewer samples than this on lines refine no pose.
@@ -63,12 +66,11 @@ def global_candidates(
     scorer = _Scorer(segments, lines, table)
     if len(poses) > _MANY:
         poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_MANY]]
-    poses = poses[np.argsort(-scorer.claimed(poses), kind='stable')[:_CLOSE]]
-    score = scorer.score(poses)
-    order = np.argsort(-score, kind='stable')[:_REFINED]
-    refined = scorer.refine(poses[order])
-    score = scorer.score(refined)
-    return _distinct(refined, score, most)
+    if len(poses) > _REFINED:
+        poses = poses[np.argsort(-scorer.claimed(poses), kind='stable')[:_CLOSE]]
+        poses = poses[np.argsort(-scorer.score(poses), kind='stable')[:_REFINED]]
+    refined = scorer.refine(poses)
+    return _distinct(refined, scorer.score(refined), most)
 
 
 def score_pose(
@@ -83,7 +85,22 @@ def score_pose(
         return 0.0, 0.0
     scorer = _Scorer(segments, FloorLines.of(line_map), table)
     at = pose.as_array()[None]
-    return float(scorer.score(at)[0]), float(scorer.claimed(at)[0])
+    claimed = scorer.claimed(at)
+    return float(_harmonic(claimed, scorer.explained(at))[0]), float(claimed[0])
+
+
+def misfits(
+    poses: Sequence[Pose2], segments: tuple[FloorSegment, ...], line_map: LineMap,
+    table: FloorTable,
+) -> list[float]:
+    """How far the strips lie off the lines that poses lay them on, root mean square, px.
+
+    Infinite for a pose that lays none on any line.
+    """
+    if not segments or not poses:
+        return [np.inf] * len(poses)
+    scorer = _Scorer(segments, FloorLines.of(line_map), table)
+    return scorer.misfit(np.array([pose.as_array() for pose in poses])).tolist()
 
 
 def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
@@ -134,6 +151,8 @@ class _Scorer:
         self._points = (starts[:, None] + share[:, None] * (ends - starts)[:, None]).reshape(-1, 2)
         self._weight = np.repeat([s.weight / _SAMPLES for s in segments], _SAMPLES)
         self._tolerance = np.repeat([0.06 + 1.5 * s.footprint for s in segments], _SAMPLES)
+        self._pixels_per_metre = np.repeat(
+            [s.pitch / max(s.footprint, 1e-9) for s in segments], _SAMPLES)
         self._segment_start, self._segment_end = starts, ends
         self._segment_tolerance = np.array([0.06 + 1.5 * s.footprint for s in segments])
         self._map_points = (
@@ -173,6 +192,14 @@ class _Scorer:
         weight = self._weight[step // 2::step]
         return on @ weight / weight.sum()
 
+    def misfit(self, poses: Array) -> Array:
+        """Root mean square distance of the samples that lie on lines from these (H,), px."""
+        on, _, distance = self._on_lines(poses)
+        square = np.square(np.where(on, distance, 0.0) * self._pixels_per_metre)
+        total = on @ self._weight
+        return np.where(
+            total > 0.0, np.sqrt(square @ self._weight / np.maximum(total, 1e-9)), np.inf)
+
     def explained(self, poses: Array) -> Array:
         """Fraction of the map lines in view that strips lie on (H,)."""
         h = len(poses)
@@ -199,13 +226,12 @@ class _Scorer:
 
     def score(self, poses: Array) -> Array:
         """Harmonic mean of both fractions (H,)."""
-        claimed, explained = self.claimed(poses), self.explained(poses)
-        return 2.0 * claimed * explained / np.maximum(claimed + explained, 1e-9)
+        return _harmonic(self.claimed(poses), self.explained(poses))
 
     def refine(self, poses: Array) -> Array:
         """Lay the strips on their lines by least squares on the floor, from poses (H, 3)."""
         lines, inverse = self._lines, 1.0 / self._tolerance
-        for _ in range(3):
+        for _ in range(_ROUNDS):
             on, which, _ = self._on_lines(poses)
             c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
             x = c * self._points[:, 0] - s * self._points[:, 1]
@@ -219,6 +245,10 @@ class _Scorer:
             step = np.linalg.solve(normal_matrix, slope[..., None])[..., 0]
             poses = np.where(on.sum(axis=1)[:, None] < _LEAST_SAMPLES, poses, poses - step)
         return poses
+
+
+def _harmonic(a: Array, b: Array) -> Array:
+    return 2.0 * a * b / np.maximum(a + b, 1e-9)
 
 
 def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:

@@ -69,6 +69,7 @@ class FloorSegment:
     :ivar footprint: how far its pixels reach across it on the floor, metres (median).
     :ivar pixels: those pixels (M, 2), in the image.
     :ivar colour: colour class.
+    :ivar pitch: side of its pixels, px of the image.
     """
 
     normal: Array
@@ -79,6 +80,7 @@ class FloorSegment:
     footprint: float
     pixels: Array
     colour: str = 'green'
+    pitch: int = 1
 
 
 def floor_segments(
@@ -122,7 +124,9 @@ def floor_segments(
         futile.clear()
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
-            segments.append(_segment(points, pixels, inside, normal, offset, colour))
+            segments.append(replace(
+                _segment(points, pixels, inside, normal, offset, colour),
+                pitch=segmentation.pitch))
             taken = inside
         else:
             # What is left of a solid must not pass for a thinner thing.
@@ -222,9 +226,12 @@ def _strip(
         beyond = points.beyond(normal, points.floor @ normal - offset, width)
         direction = np.array([-normal[1], normal[0]])
         along = points.floor @ direction
+        before = inside
         inside = _longest_run(points, along, np.flatnonzero(free & (beyond < 0.0)))
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
+        if np.array_equal(inside, before):
+            break
     low, high = along[inside].min(), along[inside].max()
     if high - low < _LEAST_LENGTH:
         return None

@@ -19,14 +19,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Set
 from dataclasses import dataclass
 
-from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.alignment import Alignment, close
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.misplaced import placement
+from nccs_pose.estimation.misplaced import placement, plainly_in_place
+from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.verdict import contradiction, lines_used, Objection, objection
+from nccs_pose.estimation.verdict import (
+    contradiction,
+    is_weak,
+    lines_used,
+    Objection,
+    objection,
+)
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.vision.colour import LineColour
@@ -45,6 +52,11 @@ _BEYOND_DOUBT = 4
 _MOST = 0.85
 # Residuals of this root mean square count half, px.
 _HALF_AS_GOOD = 1.0
+# A pose that rests on three lines and explains this part of the image explains nearly all.
+_NEARLY_ALL = 0.85
+# A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
+# deviations.
+_WEAK_GATE = 3.0
 # A direction of the pose is open when its deviation exceeds this, metres and radians.
 OPEN = 0.5
 
@@ -56,11 +68,13 @@ class Found:
     :ivar alignment: as laid on the image.
     :ivar claimed: fraction of the line-like pixels that it explains; NaN if not looked at.
     :ivar score: how much it explains altogether, 0 to 1.
+    :ivar by_strips: how much by the strips alone; NaN if not looked at.
     """
 
     alignment: Alignment
     claimed: float
     score: float
+    by_strips: float = float('nan')
 
 
 class Judge:
@@ -92,11 +106,15 @@ class Judge:
         asked = np.union1d(asked, [k for k in sorted(doubts) if alignment.support[k] >= 0.0])
         if found is not None or len(asked) == 0:
             return found
+        plain = plainly_in_place(alignment, self._map, self._table)
+        asked = np.array([k for k in asked.tolist() if k not in plain], dtype=np.intp)
+        if len(asked) == 0:
+            return None
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
         places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
         bands, slide = self._predictor.bands(places, alignment.pose)
         moved = slide[:, 3:] @ alignment.refinement.attitude
-        for k in asked.astype(int).tolist():
+        for k in asked.tolist():
             line, own = self._map[k], bands.label == k
             seen = placement(
                 image, k, bands[own], moved[own], colours[line.colour], self._options.band,
@@ -134,16 +152,33 @@ class Judge:
         """How much a pose explains, whether it holds or not."""
         score, claimed = self._searcher.score(alignment.pose, segments)
         return Found(
-            alignment, claimed, float(np.sqrt(score * alignment.explained)) * _fit(alignment))
+            alignment, claimed, float(np.sqrt(score * alignment.explained)) * fit_of(
+                float(np.mean(alignment.points.sigma**2))),
+            score)
 
 
-def _fit(alignment: Alignment) -> float:
-    """How well the lines lie on the image, 1 for perfectly.
+def fit_of(square: float) -> float:
+    """What a fit counts with so large a mean square residual, px^2; 1 for a perfect one.
 
     Where a room looks almost the same from two places this decides, not what is explained.
     """
-    sigma = alignment.points.sigma
-    return 1.0 / (1.0 + float(np.mean(sigma**2)) / _HALF_AS_GOOD**2)
+    return 1.0 / (1.0 + square / _HALF_AS_GOOD**2)
+
+
+def explains_nearly_all(found: Found) -> bool:
+    """Whether a pose leaves neither lines nor strips of any size unexplained."""
+    return (lines_used(found.alignment) >= 3
+            and min(found.claimed, found.alignment.explained) >= _NEARLY_ALL)
+
+
+def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float) -> bool:
+    """Whether a pose is where a prediction says, within so many deviations."""
+    if prediction is None:
+        return False
+    if is_weak(alignment):
+        gate = min(gate, _WEAK_GATE)
+    return close(
+        alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
 
 
 def lines_shown(alignment: Alignment) -> frozenset[int]:

@@ -22,7 +22,7 @@ cannot be trusted is not given.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import time
 
 from nccs_pose.estimation.admission import Admission
@@ -44,61 +44,39 @@ from nccs_pose.estimation.hypotheses import (
     Hypothesis,
     LEAST_IMAGES,
 )
-from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
+from nccs_pose.estimation.judge import (
+    Found,
+    is_expected,
+    Judge,
+    lines_shown,
+    OPEN,
+    settled_doubts,
+)
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.verdict import contradiction, is_weak, lines_used, Objection
+from nccs_pose.estimation.sifting import Refused, Sifter, Sight
+from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
+from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
 
 _DEFAULTS = LocaliserOptions()
-# Poses of a search that are laid on the image itself.
-_TRIED = 6
-# A search's poses lie within this of the truth in the image, px.
-_SEARCH_BAND = 5.0
-# Of a search's poses only those count that score this fraction of the best.
-_WORTH_TRYING = 0.6
 # A search that leaves less than this unexplained looks no closer.
 _PLAIN = 0.8
 # A pose elsewhere must beat the tracked one by this much to unseat it.
 _BETTER = 0.15
-# A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
-# deviations.
-_WEAK_GATE = 3.0
 # Odometry carries a pose on only while it explains this part of what looks like a line, if that is
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
 _FOREIGN = 0.25
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Refused:
-    """A pose that was laid on the image, and what the image says against it."""
-
-    objection: Objection | None = None
-    alignment: Alignment | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Sifted:
-    """What a search of the whole image leaves.
-
-    :ivar held: poses that explain the image, best first.
-    :ivar hidden: poses that would, if something hid the lines that they miss.
-    :ivar refused: the others, the best first.
-    """
-
-    held: list[Found]
-    hidden: list[Candidate]
-    refused: list[_Refused]
 
 
 class _Stopwatch:
@@ -142,27 +120,39 @@ class Localiser:
         self._aligner = Aligner(self._table, self._map, options)
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
+        self._sifter = Sifter(
+            self._aligner, self._judge, self._searcher, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""
         self._odometry.clear()
         self._admission.forget()
+        self._colours = self._aligner.nominal_colours
         self.relocalise()
 
     def relocalise(self) -> None:
-        """Forget the pose; the next image is searched as if the robot was just switched on."""
+        """Forget the pose; the next image is searched as if the robot was just switched on.
+
+        How blurred the images are is remembered: the lens stays the same.
+        """
         self._track: Track | None = None
         self._before: Track | None = None
         self._prior: tuple[Pose2, Array] | None = None
         self._ever_tracked = False
         self._frames_since_check = 0
-        self._colours = self._aligner.nominal_colours
+        self._colours = self._fresh_colours()
         # Poses among which no image has decided yet, and where the wheels were then.
         self._open: tuple[Hypothesis, ...] = ()
         self._open_odometry: Pose2 | None = None
         self._doubts: frozenset[int] = frozenset()
         # Lines that the poses since the last search rest on.
         self._shown: frozenset[int] = frozenset()
+
+    def _fresh_colours(self) -> tuple[LineColour, ...]:
+        """The colours before any image of this place, as blurred as the last image was."""
+        return tuple(
+            replace(colour, blur=known.blur)
+            for colour, known in zip(self._aligner.nominal_colours, self._colours))
 
     def set_prior(self, pose: Pose2, covariance: Array) -> None:
         """Give a hypothesis, as by hand or from the last run: it decides between equal poses.
@@ -190,7 +180,7 @@ class Localiser:
         watch = _Stopwatch()
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
-        refused = _Refused()
+        refused = Refused()
         if prediction is not None:
             followed = self._follow(image, prediction, watch)
             if isinstance(followed, Found):
@@ -210,20 +200,20 @@ class Localiser:
 
     def _follow(
         self, image: NDArray[np.uint8], prediction: Prediction, watch: _Stopwatch,
-    ) -> Found | _Refused:
+    ) -> Found | Refused:
         """Lay the predicted pose on the image; refused where the whole must be searched."""
         prior = (prediction.pose, prediction.covariance)
-        refused = _Refused()
+        refused = Refused()
         for reach in (0.0, self.options.band):
             alignment = self._aligner.align(
                 image, prediction.pose, self._colours, reach=reach, prior=prior)
             watch.lap('measure')
-            if alignment is None or not self._expected(alignment.pose, alignment, prediction):
+            if alignment is None or not self._expected(alignment, prediction):
                 continue
             against = self._judge.objection(image, alignment, self._doubts, expected=True)
             if against is None:
                 break
-            refused = _Refused(against, alignment)
+            refused = Refused(against, alignment)
         else:
             return refused
         self._frames_since_check += 1
@@ -235,34 +225,30 @@ class Localiser:
         watch.lap('detect')
         against = contradiction(alignment, segments, self._map)
         if against is not None:
-            return _Refused(against, alignment)
+            return Refused(against, alignment)
         here, claimed = self._searcher.score(alignment.pose, segments)
         # No score exceeds 1.
         elsewhere = self._searcher.candidates(segments) if here + _BETTER < 1.0 else ()
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):
-            return _Refused(Objection('another pose explains the image better'), alignment)
+            return Refused(Objection('another pose explains the image better'), alignment)
         return Found(alignment, claimed, alignment.explained)
 
-    def _expected(self, pose: Pose2, alignment: Alignment, prediction: Prediction | None) -> bool:
-        """Whether a pose is where the prediction says, within the gate."""
-        if prediction is None:
-            return False
-        gate = self.options.innovation_gate
-        if is_weak(alignment):
-            gate = min(gate, _WEAK_GATE)
-        return close(pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
+    def _expected(self, alignment: Alignment, prediction: Prediction | None) -> bool:
+        return is_expected(alignment, prediction, self.options.innovation_gate)
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
-        refused: _Refused, watch: _Stopwatch,
+        refused: Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         segments, candidates = self._seen(image, watch)
         now = self._odometry.at(stamp_ns)
         hypotheses = carried(self._open, self._open_odometry, now)
-        sifted = self._sift(image, candidates, hypotheses, segments, prediction, watch)
+        sifted = self._sifter.sift(
+            Sight(image, segments, candidates, self._fresh_colours()), hypotheses,
+            self._doubts, prediction, lambda: watch.lap('measure'))
         held = sifted.held
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
@@ -314,45 +300,6 @@ class Localiser:
                 break
         return segments, candidates
 
-    def _sift(
-        self, image: NDArray[np.uint8], candidates: tuple[Candidate, ...],
-        hypotheses: tuple[Hypothesis, ...], segments: tuple[FloorSegment, ...],
-        prediction: Prediction | None, watch: _Stopwatch,
-    ) -> _Sifted:
-        """Lay hypotheses, the best candidates and their twins on the image itself."""
-        worth = _WORTH_TRYING * candidates[0].score if candidates else 0.0
-        starts = [(h.pose, 1.0, self.options.band) for h in hypotheses]
-        starts += [(c.pose, c.score, _SEARCH_BAND) for c in candidates[:_TRIED]]
-        sifted = _Sifted([], [], [])
-        seen: list[Pose2] = []
-        # What holds adds its twins to the end of the queue.
-        for start, promise, reach in starts:
-            # A pose scores the root of this at most.
-            best = max((f.score for f in sifted.held), default=0.0)
-            if promise < max(worth, (self.options.ambiguity_ratio * best) ** 2):
-                continue
-            if any(same_pose(start, pose) for pose in seen):
-                continue
-            alignment = self._aligner.align(
-                image, start, self._aligner.nominal_colours, reach=reach)
-            watch.lap('measure')
-            if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
-                continue
-            seen.append(alignment.pose)
-            found = self._judge.found(
-                image, alignment, segments, self._doubts,
-                expected=self._expected(alignment.pose, alignment, prediction))
-            if isinstance(found, Objection):
-                sifted.refused.append(_Refused(found, alignment))
-                if found.hidden:
-                    score, _ = self._searcher.score(alignment.pose, segments)
-                    sifted.hidden.append(Candidate(alignment.pose, score))
-                continue
-            sifted.held.append(found)
-            starts += [(s @ found.alignment.pose, 1.0, _SEARCH_BAND) for s in self._symmetries]
-        sifted.held.sort(key=lambda f: -f.score)
-        return sifted
-
     def _trusted(
         self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,
     ) -> tuple[Found, Prediction] | None:
@@ -374,7 +321,7 @@ class Localiser:
             near = [f for f in good if close(
                 f.alignment.pose, pose, covariance + f.alignment.covariance, _PRIOR_GATE)]
         else:
-            near = [f for f in good if self._expected(f.alignment.pose, f.alignment, prediction)]
+            near = [f for f in good if self._expected(f.alignment, prediction)]
         return near[0] if len(near) == 1 else None
 
     def _tracking(
@@ -435,7 +382,7 @@ class Localiser:
 
     def _without_pose(
         self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
-        refused: _Refused, watch: _Stopwatch,
+        refused: Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
         against, doubted, track = refused.objection, None, self._track

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.verdict import line_offsets
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
@@ -58,6 +59,7 @@ _EVIDENT = 5.0
 _DISTURBED = 0.28
 # It is in its place when it is off by less than this for certain, px.
 _IN_PLACE = 0.5
+_QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 # What lies this near another line, metres beyond its footprint, is that line.
 _ON_ANOTHER = 0.05
 
@@ -72,6 +74,27 @@ class Placement:
 
     beside: float | None = None
     confirmed: bool = False
+
+
+def plainly_in_place(
+    alignment: Alignment, line_map: LineMap, table: FloorTable,
+) -> frozenset[int]:
+    """Lines, wide enough to be told from all else, that the pose itself rests on where they are.
+
+    They need no second look at the image.
+    """
+    mean, deviation = line_offsets(alignment, len(line_map))
+    label = alignment.points.label
+    _, jacobian = table.floor(alignment.points.pixels)
+    # Normals of the lines in base_link, and how far a pixel reaches along them.
+    normals = line_map.directions[:, :2] @ alignment.pose.rotation[:2, :2] @ _QUARTER_TURN
+    reach = np.linalg.norm(np.einsum('pij,pi->pj', jacobian, normals[label]), axis=1)
+    plain = []
+    for k in np.flatnonzero(alignment.support >= _PLAIN_SHARE).tolist():
+        wide = line_map[k].width >= _PLAIN_WIDTH * float(np.median(reach[label == k]))
+        if wide and abs(mean[k]) + 2.0 * deviation[k] < _IN_PLACE:
+            plain.append(k)
+    return frozenset(plain)
 
 
 def placement(

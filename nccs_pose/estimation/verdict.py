@@ -76,7 +76,7 @@ def objection(
         return Objection(
             f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not fit the '
             'image')
-    mean, deviation = _line_offsets(alignment, len(line_map))
+    mean, deviation = line_offsets(alignment, len(line_map))
     off = np.abs(mean) > np.maximum(options.largest_misfit, _EVIDENT * deviation)
     if off.any():
         k = int(np.where(off, np.abs(mean), 0.0).argmax())
@@ -111,7 +111,7 @@ def _misfits(alignment: Alignment) -> tuple[float, float]:
             float(np.sqrt(np.mean((residual * told) ** 2))))
 
 
-def _line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
+def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     """Mean offset of each whole line (L,) and its standard deviation, px; 0 where unused.
 
     The deviation comes from the line's own scatter: a line that lies off as a whole must not

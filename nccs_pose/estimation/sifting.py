@@ -1,0 +1,175 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which of many poses hold when they are laid on the image itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import dataclass
+import math
+
+from nccs_pose.estimation.alignment import Aligner, Alignment
+from nccs_pose.estimation.association import same_pose
+from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.hypotheses import Hypothesis
+from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
+from nccs_pose.estimation.motion import Prediction
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.verdict import Objection
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.vision.colour import LineColour
+import numpy as np
+from numpy.typing import NDArray
+
+# Candidates that are laid on the image.
+_TRIED = 6
+# They lie within this of the truth in the image, px.
+_SEARCH_BAND = 5.0
+# Only those count that score this fraction of the best.
+_WORTH_TRYING = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A pose that was laid on the image, and what the image says against it."""
+
+    objection: Objection | None = None
+    alignment: Alignment | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sifted:
+    """What a search of the whole image leaves.
+
+    :ivar held: poses that explain the image, best first.
+    :ivar hidden: poses that would, if something hid the lines that they miss.
+    :ivar refused: the others, the best first.
+    """
+
+    held: list[Found]
+    hidden: list[Candidate]
+    refused: list[Refused]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One image that is searched.
+
+    :ivar image: (H, W, 3) uint8 BGR.
+    :ivar segments: the strips in it.
+    :ivar candidates: poses that explain them, best first.
+    :ivar colours: what tapes look like to begin with.
+    """
+
+    image: NDArray[np.uint8]
+    segments: tuple[FloorSegment, ...]
+    candidates: tuple[Candidate, ...]
+    colours: tuple[LineColour, ...]
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A pose to lay on an image.
+
+    :ivar reach: how far it may be off in the image, px.
+    :ivar score: of the strips, 0 to 1; None if it has to be tried in any case.
+    :ivar misfit: how far the strips lie off its lines, px.
+    """
+
+    pose: Pose2
+    reach: float
+    score: float | None = None
+    misfit: float = 0.0
+
+
+class Sifter:
+    """Lays poses on images of one rig and map."""
+
+    def __init__(
+        self, aligner: Aligner, judge: Judge, searcher: Searcher, symmetries: tuple[Pose2, ...],
+        options: LocaliserOptions,
+    ) -> None:
+        """Prepare.
+
+        :param symmetries: motions of the map that change nothing, without the identity.
+        """
+        self._aligner = aligner
+        self._judge = judge
+        self._searcher = searcher
+        self._symmetries = symmetries
+        self._options = options
+
+    def sift(
+        self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
+        prediction: Prediction | None, measured: Callable[[], None],
+    ) -> Sifted:
+        """Lay hypotheses, the best candidates and their twins on an image.
+
+        :param doubts: lines that were seen beside their place and not in it since.
+        :param measured: called whenever a pose has been laid on the image.
+        """
+        options, candidates = self._options, list(sight.candidates[:_TRIED])
+        starts = [_Start(h.pose, options.band) for h in hypotheses]
+        candidates = [c for c in candidates if c.score >= _WORTH_TRYING * candidates[0].score]
+        off = self._searcher.misfits([c.pose for c in candidates], sight.segments)
+        starts += [
+            _Start(c.pose, _SEARCH_BAND, c.score, misfit) for c, misfit in zip(candidates, off)]
+        sifted = Sifted([], [], [])
+        seen: list[Pose2] = []
+        best: tuple[_Start, Found] | None = None
+        # What holds adds its twins to the end of the queue.
+        for start in starts:
+            if best is not None and not self._rivals(start, *best):
+                continue
+            if any(same_pose(start.pose, pose) for pose in seen):
+                continue
+            alignment = self._aligner.align(
+                sight.image, start.pose, sight.colours, reach=start.reach)
+            measured()
+            if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
+                continue
+            seen.append(alignment.pose)
+            found = self._judge.found(
+                sight.image, alignment, sight.segments, doubts,
+                expected=is_expected(alignment, prediction, options.innovation_gate))
+            if isinstance(found, Objection):
+                sifted.refused.append(Refused(found, alignment))
+                if found.hidden:
+                    score, _ = self._searcher.score(alignment.pose, sight.segments)
+                    sifted.hidden.append(Candidate(alignment.pose, score))
+                continue
+            sifted.held.append(found)
+            starts += [_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries]
+            if best is None or found.score > best[1].score:
+                best = start, found
+        sifted.held.sort(key=lambda f: -f.score)
+        return sifted
+
+    def _rivals(self, start: _Start, held_from: _Start, held: Found) -> bool:
+        """Whether what a pose shows on the strips leaves it a chance against one that holds.
+
+        No pose scores more on the image than the root of what it scores on the strips, times
+        what is left of that by how far they lie off its lines; and where the strips show all that
+        the pose that holds expects, and nothing else, they tell rivals as well as the image.
+        """
+        if start.score is None:
+            return True
+        ratio = self._options.ambiguity_ratio
+        if explains_nearly_all(held) and start.score < ratio * held.by_strips:
+            return False
+        excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
+        return math.sqrt(start.score) * fit_of(excess) >= ratio * held.score
