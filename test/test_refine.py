@@ -124,6 +124,22 @@ def test_the_prepared_form_is_the_residual_of_a_rig_that_heaves_and_tilts(name: 
         scale = e / s0
         np.testing.assert_allclose(jacobian[:, 3 + k], numeric * scale, rtol=1e-4, atol=1e-3)
 
+
+def test_the_prepared_form_knows_what_a_shifted_image_does() -> None:
+    rig, pose = TABLE_ONE['hyperbolic'], Pose2(0.12, -0.15, 0.72)
+    pixels, label = seen(rig, MIXED, pose, 20, np.random.default_rng(1))
+    d, mu, sigma = MIXED.directions[label], MIXED.moments[label], np.linspace(0.1, 2.0, len(label))
+    form = SideForm(rig.back_project(pixels), d, mu, sigma, 0.0, False)
+    shift = form.image_shift(pose.as_array())
+    # On the line itself the weight's change does nothing.
+    for k in range(2):
+        step = np.eye(2)[k] * 1e-4
+        ahead, behind = (
+            SideForm(rig.back_project(pixels + way), d, mu, sigma, 0.0, False).residual(
+                pose.as_array())[0] for way in (step, -step))
+        np.testing.assert_allclose(shift[:, k], (ahead - behind) / 2e-4, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize('name', TABLE_ONE)
 def test_the_residual_is_the_distance_in_the_image(name: str) -> None:
     rig, pose = TABLE_ONE[name], Pose2(0.1, -0.2, 0.7)

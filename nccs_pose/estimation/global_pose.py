@@ -37,7 +37,7 @@ from nccs_pose.estimation.observability import (
     unobserved_directions,
 )
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
-from nccs_pose.estimation.small_matrices import inverse_3x3
+from nccs_pose.estimation.small_matrices import inverse_3x3, solved
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -206,11 +206,13 @@ def _polished(data: LabelledRays, weights: Array, pose: Pose2) -> _Found:
     jacobian = monomials_jacobian(pose).T @ data.rows
     weighted = jacobian * weights
     information = weighted @ jacobian.T
-    values, vectors = np.linalg.eigh(information)
-    # Where the rays say nothing the pose stays.
-    heard = values > 1e-12 * values[-1]
-    slope = vectors.T @ (weighted @ (monomials(pose) @ data.rows))
-    step = vectors[:, heard] @ (slope[heard] / values[heard])
+    slope = weighted @ (monomials(pose) @ data.rows)
+    step = solved(information, slope)
+    if step is None:
+        values, vectors = np.linalg.eigh(information)
+        # Where the rays say nothing the pose stays.
+        heard = values > 1e-12 * values[-1]
+        step = vectors[:, heard] @ ((vectors.T @ slope)[heard] / values[heard])
     pose = Pose2.from_array(pose.as_array() - step)
     s = monomials(pose) @ data.rows
     return _Found(pose, float(weights @ (s * s)), information, data.in_front(pose))

@@ -34,7 +34,7 @@ import math
 
 from nccs_pose.estimation.general_lines import ALIGNED
 from nccs_pose.estimation.pose_monomials import feet_in_plan
-from nccs_pose.estimation.small_matrices import inverse_2x2
+from nccs_pose.estimation.small_matrices import inverse_2x2, solved
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 
@@ -137,6 +137,9 @@ def unobserved_directions(
     :param limit: a direction is unobserved when its standard deviation, in metres and radians
         alike, is larger than this.
     """
+    if solved(information - np.eye(3) / (limit * limit), np.zeros(3)) is not None:
+        # What remains is positive definite: all eigenvalues are larger than that.
+        return ()
     values, vectors = np.linalg.eigh(information)
     found = []
     for value, vector in zip(values.tolist(), vectors.T):

@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.residual import check_rays_and_lines
 from nccs_pose.estimation.side_form import SideForm
+from nccs_pose.estimation.small_matrices import solved
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -65,22 +66,31 @@ class _Problem:
     """Pixels on their lines, and what is known of the unknowns beforehand.
 
     The unknowns are (x, y, yaw), followed by (z, roll, pitch) where those are free.
+
+    :ivar information: about them; None where nothing is known.
     """
 
     form: SideForm
     expected: Array
-    information: Array
+    information: Array | None
 
-    def deviation(self, unknowns: Array) -> Array:
-        difference = unknowns - self.expected
-        difference[2] = math.remainder(difference[2], 2.0 * math.pi)
-        return difference
+    def pull(self, unknowns: Array) -> tuple[float, Array | float]:
+        """Cost of the deviation from what is known, and half its slope."""
+        if self.information is None:
+            return 0.0, 0.0
+        deviation = unknowns - self.expected
+        deviation[2] = math.remainder(deviation[2], 2.0 * math.pi)
+        slope = self.information @ deviation
+        return float(deviation @ slope), slope
 
-    def cost(self, e: Array, width: float, unknowns: Array) -> float:
-        """Cauchy's loss of the residuals (their squares at infinite width), and the prior."""
-        loss = e @ e if np.isinf(width) else width**2 * np.log1p(np.square(e / width)).sum()
-        deviation = self.deviation(unknowns)
-        return float(loss + deviation @ self.information @ deviation)
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Unknowns, with the residuals (N,) and their Jacobian (N, P) there."""
+
+    unknowns: Array
+    e: Array
+    jacobian: Array
 
 
 def refine(
@@ -119,50 +129,56 @@ def refine(
         direction that is not of unit length, a sigma that is not positive, or a value that is
         not finite.
     """
-    sigma = np.broadcast_to(np.asarray(sigma, dtype=float), (len(rays),))
+    sigma = np.asarray(sigma, dtype=float)
     if len(rays) < 3:
         raise EstimationError(f'{len(rays)} pixels cannot fix a pose; at least 3 are needed')
     check_rays_and_lines(rays, directions, moments, sigma)
-    expected, known = _prior(start, prior, attitude_sigma)
+    expected, information = _prior(start, prior, attitude_sigma)
     form = SideForm(rays, directions, moments, sigma, sigma_world, len(expected) == 6)
-    problem = _Problem(form, expected, known)
+    problem = _Problem(form, expected, information)
+    known = _VAGUE_INFORMATION[:len(expected), :len(expected)]
+    if information is not None:
+        known = information + known
     unknowns = np.concatenate([start.as_array(), expected[3:]])
-    inlier, scale, converged = np.ones(len(rays), dtype=bool), 1.0, True
+    point, scale, converged = _Point(unknowns, *form.residual(unknowns)), 1.0, True
+    inlier = np.ones(len(rays), dtype=bool)
     if robust:
-        unknowns, e, jacobian, converged = _descend(problem, unknowns, True, max_iterations)
-        scale = _robust_scale(e)
-        inlier = np.abs(e) <= _GATE * scale
-    trusted = problem if inlier.all() else replace(problem, form=form.of(inlier))
-    unknowns, e, jacobian, finished = _descend(trusted, unknowns, False, max_iterations)
-    if trusted is not problem:
-        e, jacobian = form.residual(unknowns)
-    normal = jacobian[inlier].T @ jacobian[inlier]
+        point, converged = _descend(problem, known, point, None, max_iterations)
+        scale = _robust_scale(point.e)
+        inlier = np.abs(point.e) <= _GATE * scale
+    count = int(np.count_nonzero(inlier))
+    trusted = inlier.astype(float) if count < len(inlier) else 1.0
+    point, finished = _descend(problem, known, point, trusted, max_iterations)
+    e, jacobian = point.e, point.jacobian
+    weighted = jacobian.T * trusted
+    normal = weighted @ jacobian
     # Residuals larger than the noise was told to be widen the claim; smaller ones do not
     # narrow it.
-    degrees = max(1, int(inlier.sum()) - 3)
-    inflation = float(e[inlier] @ e[inlier]) / degrees
+    inflation = float(e @ (e * trusted)) / max(1, count - 3)
     inflation = max(1.0, inflation) if noise_known else max(1e-6, inflation)
-    covariance = np.linalg.inv(normal / inflation + known + _vague(len(known)))
+    covariance = np.linalg.inv(normal / inflation + known)
     if calibration_sigma > 0.0:
-        shift = form.image_shift(unknowns)[inlier]
-        answer = covariance @ (jacobian[inlier].T @ shift) * (calibration_sigma / inflation)
+        shift = form.image_shift(point.unknowns)
+        answer = covariance @ (weighted @ shift) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     covariance = covariance[:3, :3]
-    attitude = unknowns[3:] if len(unknowns) == 6 else np.zeros(3)
+    attitude = point.unknowns[3:] if len(expected) == 6 else np.zeros(3)
     return Refinement(
-        Pose2.from_array(unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
+        Pose2.from_array(point.unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
         attitude, e, inlier, scale, converged and finished)
 
 
 def _prior(
     start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
-) -> tuple[Array, Array]:
-    """Expected unknowns and the information about them, before any pixel is seen."""
+) -> tuple[Array, Array | None]:
+    """Expected unknowns and the information about them, if any, before any pixel is seen."""
     height, tilt = attitude_sigma
     free = height > 0.0 or tilt > 0.0
     expected = np.zeros(6 if free else 3)
-    information = np.zeros((len(expected), len(expected)))
     expected[:3] = start.as_array() if prior is None else prior[0].as_array()
+    if prior is None and not free:
+        return expected, None
+    information = np.zeros((len(expected), len(expected)))
     if prior is not None:
         information[:3, :3] = np.linalg.inv(prior[1])
     if free:
@@ -172,44 +188,61 @@ def _prior(
     return expected, information
 
 
-def _vague(size: int) -> Array:
-    return _VAGUE_INFORMATION[:size, :size]
-
-
 def _robust_scale(e: Array) -> float:
     """Standard deviation of the bulk of whitened residuals, never below the noise told."""
-    middle = [(len(e) - 1) // 2, len(e) // 2]
-    return max(1.0, 1.4826 * float(np.partition(np.abs(e), middle)[middle].mean()))
+    size, low, high = np.abs(e), (len(e) - 1) // 2, len(e) // 2
+    size.partition([low, high])
+    return max(1.0, 1.4826 * 0.5 * float(size[low] + size[high]))
 
 
 def _descend(
-    problem: _Problem, unknowns: Array, cauchy: bool, max_iterations: int,
-) -> tuple[Array, Array, Array, bool]:
+    problem: _Problem, known: Array, point: _Point, trusted: Array | float | None,
+    max_iterations: int,
+) -> tuple[_Point, bool]:
     """Levenberg-Marquardt.
 
-    :returns: where it ends, residuals and their Jacobian there, and whether it converged.
+    :param known: what makes the normal equations regular (P, P).
+    :param trusted: weights of the squares (N,), or one for all; None for Cauchy's loss.
+    :returns: where it ends, and whether it converged.
     """
-    damping, known = 0.0, problem.information + _vague(len(unknowns))
-    e, jacobian = problem.form.residual(unknowns)
+    damping, width = 0.0, math.inf
+    pull, pull_slope = problem.pull(point.unknowns)
     for _ in range(max_iterations):
-        width = _CAUCHY * _robust_scale(e) if cauchy else np.inf
-        weight = 1.0 / (1.0 + np.square(e / width))
-        weighted = jacobian.T * weight
-        normal = weighted @ jacobian + known
-        slope = weighted @ e + problem.information @ problem.deviation(unknowns)
+        e, weight = point.e, trusted
+        if weight is None:
+            width = _CAUCHY * _robust_scale(e)
+            weight = 1.0 / (1.0 + e * e / width**2)
+        weighted = point.jacobian.T * weight
+        normal = weighted @ point.jacobian + known
         damped = normal + damping * np.diag(np.diag(normal)) if damping else normal
-        step = -np.linalg.solve(damped, slope)
-        trial = unknowns + step
-        e_trial, jacobian_trial = problem.form.residual(trial)
-        if problem.cost(e_trial, width, trial) <= problem.cost(e, width, unknowns):
-            unknowns, e, jacobian = trial, e_trial, jacobian_trial
+        step = _solution(damped, weighted @ e + pull_slope)
+        unknowns = point.unknowns - step
+        trial = _Point(unknowns, *problem.form.residual(unknowns))
+        pull_there, slope_there = problem.pull(unknowns)
+        if _loss(trial.e, trusted, width) + pull_there <= _loss(e, trusted, width) + pull:
+            point, pull, pull_slope = trial, pull_there, slope_there
             damping *= 0.1 if damping > 1e-6 else 0.0
         else:
             damping = max(1e-3, 10.0 * damping)
         # A step far below what the pixels can tell ends the search; the robust stage only has to
         # find the inliers.
-        if float(step @ normal @ step) < (1e-2 if cauchy else 1e-7):
-            return unknowns, e, jacobian, True
+        if float(step @ normal @ step) < (1e-2 if trusted is None else 1e-7):
+            return point, True
         if damping > 1e8:
-            return unknowns, e, jacobian, False
-    return unknowns, e, jacobian, False
+            return point, False
+    return point, False
+
+
+def _loss(e: Array, trusted: Array | float | None, width: float) -> float:
+    """Sum of the residuals' trusted squares, or of Cauchy's loss of this width."""
+    if trusted is None:
+        return width**2 * float(np.log1p(e * e / width**2).sum())
+    return float(e @ (e * trusted))
+
+
+def _solution(matrix: Array, right: Array) -> Array:
+    """Solution (P,) of the normal equations."""
+    found = solved(matrix, right) if len(right) == 3 else None
+    if found is None:
+        found = np.asarray(np.linalg.solve(matrix, right), dtype=float)
+    return found

@@ -21,7 +21,7 @@ another ray. All are rows of one array, and a pose costs one small matrix produc
 
 from __future__ import annotations
 
-from nccs_pose.estimation.pose_monomials import monomial_rows, monomials_and_slopes
+from nccs_pose.estimation.pose_monomials import forms, monomials_and_slopes, with_derivatives
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -31,38 +31,35 @@ class SideForm:
     """Whitened residuals of N rays against N lines, as functions of pose and attitude."""
 
     def __init__(
-        self, rays: Rays, directions: Array, moments: Array, sigma: Array, sigma_world: float,
-        with_attitude: bool,
+        self, rays: Rays, directions: Array, moments: Array, sigma: Array | float,
+        sigma_world: float, with_attitude: bool,
     ) -> None:
         """Prepare the rows.
 
         :param directions: unit directions of the lines in the map (N, 3).
         :param moments: their moments (N, 3), metres.
-        :param sigma: standard deviation of the pixels along the curve's normal, px (N,).
+        :param sigma: standard deviation of the pixels along the curve's normal, px, (N,) or one.
         :param sigma_world: standard deviation of the lines' own position, metres.
         :param with_attitude: whether height, roll and pitch are unknowns too.
         """
-        r, w = rays.direction, rays.moment
-        ray = [r, rays.direction_jacobian[:, :, 0], rays.direction_jacobian[:, :, 1]]
-        moment = [w, rays.moment_jacobian[:, :, 0], rays.moment_jacobian[:, :, 1]]
-        zero = np.zeros(len(r))
+        self._with_attitude, self._in_world = with_attitude, sigma_world > 0.0
+        ray = with_derivatives(rays, 3 * with_attitude + self._in_world)
+        ray[:, 1:3] *= sigma
+        self._sigma = sigma
+        r_x, r_y, r_z, w_x, w_y, w_z = ray[:, 0]
         if with_attitude:
             # A base that rises or turns by a little moves its rays: w by e_z x r; r and w by
             # e_x x, and by e_y x.
-            ray += [np.zeros_like(r), np.column_stack([zero, -r[:, 2], r[:, 1]]),
-                    np.column_stack([r[:, 2], zero, -r[:, 0]])]
-            moment += [np.column_stack([-r[:, 1], r[:, 0], zero]),
-                       np.column_stack([zero, -w[:, 2], w[:, 1]]),
-                       np.column_stack([w[:, 2], zero, -w[:, 0]])]
-        if sigma_world > 0.0:
-            ray.append(np.zeros_like(r))
-            moment.append(r)
-        rows = monomial_rows(np.array(ray), np.array(moment), directions, moments)
-        # by monomial (7, K, N): what belongs to one pixel lies apart, and vectors in one piece
-        self._rows = np.ascontiguousarray(np.moveaxis(rows, 2, 0))
-        self._variance = np.square(sigma)
+            ray[:, 3:6] = 0.0
+            ray[3, 3], ray[4, 3] = -r_y, r_x
+            ray[1, 4], ray[2, 4], ray[4, 4], ray[5, 4] = -r_z, r_y, -w_z, w_y
+            ray[0, 5], ray[2, 5], ray[3, 5], ray[5, 5] = r_z, -r_x, w_z, -w_x
+        if self._in_world:
+            # S of (0, r) is the cosine between ray and line.
+            ray[:3, -1], ray[3:, -1] = 0.0, sigma_world * ray[:3, 0]
+        # By monomial (7, K, N): what belongs to one pixel lies apart, and vectors in one piece.
+        self._rows = forms(ray, np.concatenate([directions, moments], axis=1))
         self._world_variance = sigma_world**2
-        self._with_attitude = with_attitude
 
     def residual(self, unknowns: Array) -> tuple[Array, Array]:
         """Residuals e (N,) and their Jacobian (N, 3), or (N, 6) with the attitude.
@@ -74,35 +71,29 @@ class SideForm:
         """
         form = monomials_and_slopes(*unknowns[:3].tolist())
         values = (form @ self._rows.reshape(7, -1)).reshape(4, *self._rows.shape[1:])
-        s, s_pose = values[0, 0], values[1:, 0]
-        g_u, g_v = values[0, 1], values[0, 2]
-        variance = self._variance * (g_u * g_u + g_v * g_v)
-        half_slope = self._variance * (values[1:, 1] * g_u + values[1:, 2] * g_v)
-        if self._world_variance > 0.0:
-            cosine = values[0, -1]
-            variance = variance + self._world_variance * (1.0 - cosine * cosine)
-            half_slope = half_slope - self._world_variance * cosine * values[1:, -1]
+        s, gradient = values[:, 0], values[:, 1:3]
+        # The variance, and half its slopes by the pose.
+        products = gradient * gradient[0]
+        variances = products[:, 0] + products[:, 1]
+        if self._in_world:
+            variances -= values[:, -1] * values[0, -1]
+            variances[0] += self._world_variance
         # A ray along the line, or a pixel where nothing changes, has no distance to tell.
-        variance = np.maximum(variance, 1e-30)
+        variance = np.maximum(variances[0], 1e-30)
         scale = 1.0 / np.sqrt(variance)
+        e = s[0] * scale
         if self._with_attitude:
-            s = s + unknowns[3:] @ values[0, 3:6]
-        jacobian = scale * (s_pose - s / variance * half_slope)
+            e += unknowns[3:] @ values[0, 3:6] * scale
+        jacobian = np.empty((6 if self._with_attitude else 3, len(e)))
+        np.multiply(s[1:], scale, out=jacobian[:3])
+        jacobian[:3] -= variances[1:] * (e / variance)
         if self._with_attitude:
-            jacobian = np.vstack([jacobian, scale * values[0, 3:6]])
-        return s * scale, jacobian.T
+            np.multiply(values[0, 3:6], scale, out=jacobian[3:])
+        return e, jacobian.T
 
     def image_shift(self, unknowns: Array) -> Array:
         """de/d(u, v) (N, 2): what a shift of the whole image does to the residuals."""
         form = monomials_and_slopes(*unknowns[:3].tolist())[0]
-        g_u, g_v = form @ self._rows[:, 1], form @ self._rows[:, 2]
-        variance = self._variance * (g_u * g_u + g_v * g_v)
-        return (np.stack([g_u, g_v]) / np.sqrt(np.maximum(variance, 1e-30))).T
-
-    def of(self, chosen: Array) -> SideForm:
-        """The same for some of the pixels."""
-        part = object.__new__(SideForm)
-        part.__dict__.update(self.__dict__)
-        part._rows = np.ascontiguousarray(self._rows[:, :, chosen])
-        part._variance = self._variance[chosen]
-        return part
+        gradient = (form @ self._rows[:, 1:3].reshape(7, -1)).reshape(2, -1)
+        variance = (gradient * gradient).sum(axis=0)
+        return (gradient / (self._sigma * np.sqrt(np.maximum(variance, 1e-30)))).T

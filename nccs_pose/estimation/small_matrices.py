@@ -54,6 +54,13 @@ def solve_3x3(
     return bx - ax * z, by - ay * z, z
 
 
+def solved(matrix: Array, right: Array) -> Array | None:
+    """The same for a matrix (3, 3) and a right side (3,)."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrix.tolist()
+    found = solve_3x3(xx, xy, yy, xz, yz, zz, *right.tolist())
+    return None if found is None else np.array(found)
+
+
 def inverse_3x3(matrix: Array) -> Array | None:
     """Inverse of a symmetric matrix (3, 3), positive definite beyond rounding; else None."""
     (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
