@@ -22,6 +22,7 @@ explains the image, best first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import math
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -265,5 +266,5 @@ def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:
 
 def same_pose(a: Pose2, b: Pose2) -> bool:
     """Whether two poses are close enough to converge to one."""
-    return (np.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
-            and abs(float(wrap_angle(a.yaw - b.yaw))) < _SAME_YAW)
+    return (math.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
+            and abs(math.remainder(a.yaw - b.yaw, 2.0 * math.pi)) < _SAME_YAW)

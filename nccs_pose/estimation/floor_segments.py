@@ -124,9 +124,8 @@ def floor_segments(
         futile.clear()
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
-            segments.append(replace(
-                _segment(points, pixels, inside, normal, offset, colour),
-                pitch=segmentation.pitch))
+            segments.append(
+                _segment(points, segmentation, pixels, inside, normal, offset, colour))
             taken = inside
         else:
             # What is left of a solid must not pass for a thinner thing.
@@ -261,12 +260,13 @@ def _longest_run(
 
 
 def _segment(
-    points: FloorPoints, pixels: Array, inside: NDArray[np.intp], normal: Array, offset: float,
-    colour: str,
+    points: FloorPoints, segmentation: Segmentation, pixels: Array, inside: NDArray[np.intp],
+    normal: Array, offset: float, colour: str,
 ) -> FloorSegment:
     direction = np.array([-normal[1], normal[0]])
     along = points.floor[inside] @ direction
     return FloorSegment(
         normal, offset, offset * normal + along.min() * direction,
         offset * normal + along.max() * direction, float(points.weight[inside].sum()),
-        float(np.median(points[inside].footprint(normal))), pixels[inside], colour)
+        float(np.median(points.footprint(normal)[inside])), pixels[inside], colour,
+        segmentation.pitch)

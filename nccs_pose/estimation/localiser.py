@@ -248,7 +248,8 @@ class Localiser:
         hypotheses = carried(self._open, self._open_odometry, now)
         sifted = self._sifter.sift(
             Sight(image, segments, candidates, self._fresh_colours()), hypotheses,
-            self._doubts, prediction, lambda: watch.lap('measure'))
+            self._doubts, prediction)
+        watch.lap('measure')
         held = sifted.held
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.

@@ -89,12 +89,12 @@ def plainly_in_place(
     # Normals of the lines in base_link, and how far a pixel reaches along them.
     normals = line_map.directions[:, :2] @ alignment.pose.rotation[:2, :2] @ _QUARTER_TURN
     reach = np.linalg.norm(np.einsum('pij,pi->pj', jacobian, normals[label]), axis=1)
-    plain = []
-    for k in np.flatnonzero(alignment.support >= _PLAIN_SHARE).tolist():
-        wide = line_map[k].width >= _PLAIN_WIDTH * float(np.median(reach[label == k]))
-        if wide and abs(mean[k]) + 2.0 * deviation[k] < _IN_PLACE:
-            plain.append(k)
-    return frozenset(plain)
+    count = np.maximum(np.bincount(label, minlength=len(line_map)), 1)
+    width = line_map.widths * count / np.maximum(
+        np.bincount(label, reach, minlength=len(line_map)), 1e-12)
+    return frozenset(np.flatnonzero(
+        (alignment.support >= _PLAIN_SHARE) & (width >= _PLAIN_WIDTH)
+        & (np.abs(mean) + 2.0 * deviation < _IN_PLACE)).tolist())
 
 
 def placement(

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Set
 from dataclasses import dataclass
 import math
 
@@ -115,12 +115,11 @@ class Sifter:
 
     def sift(
         self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
-        prediction: Prediction | None, measured: Callable[[], None],
+        prediction: Prediction | None,
     ) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image.
 
         :param doubts: lines that were seen beside their place and not in it since.
-        :param measured: called whenever a pose has been laid on the image.
         """
         options, candidates = self._options, list(sight.candidates[:_TRIED])
         starts = [_Start(h.pose, options.band) for h in hypotheses]
@@ -139,7 +138,6 @@ class Sifter:
                 continue
             alignment = self._aligner.align(
                 sight.image, start.pose, sight.colours, reach=start.reach)
-            measured()
             if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
                 continue
             seen.append(alignment.pose)

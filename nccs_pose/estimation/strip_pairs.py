@@ -78,10 +78,10 @@ def poses_of_pairs(segments: tuple[FloorSegment, ...], lines: FloorLines) -> Arr
     poses: list[Array] = []
     for begin in range(0, len(pair), _ENOUGH // 2):
         part = slice(begin, begin + _ENOUGH // 2)
-        for turn in (0.0, np.pi):
-            poses.append(_intersect(
-                yaw[part] + turn, strips[first[part]], strips[second[part]], a[part], b[part],
-                lines))
+        # Either way round.
+        turned = np.concatenate([yaw[part], yaw[part] + np.pi])
+        one, other, on_a, on_b = (np.tile(index[part], 2) for index in (first, second, a, b))
+        poses.append(_intersect(turned, strips[one], strips[other], on_a, on_b, lines))
         if sum(map(len, poses)) > _ENOUGH:
             break
     return np.concatenate(poses) if poses else np.zeros((0, 3))
