@@ -33,11 +33,12 @@ from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
 _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
-_BEYOND = 3.0  # standard deviations: scatter of the pulls that is no chance
+_CHANCE = 1e-3  # probability with which noise as told widens the claims
 _SOUND = 5.0  # robust residual in units of the noise as told, beyond which nothing fits yet
 _FEET = 2  # how often the feet of the perpendiculars are dropped
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
@@ -183,18 +184,18 @@ def adjust(
         used += more
     e = terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
-    chi2 = float(e @ e) / degrees
+    reduced = float(e @ e) / degrees
     system = ArrowSystem.of(terms, inlier.astype(float), problem.slices)
     information, _, gain = system.reduced()
     # Residuals larger than the noise was told to be widen the claim, and so do errors that the
     # points of a frame share; smaller ones do not narrow it.
     found = pull_statistics(*system.pulls(), parameters.spread)
-    chance = 1.0 + _BEYOND * np.sqrt(2.0 / (max(found.freedom, 1) * observations.frames))
-    shared = found.scatter if found.scatter > chance else 1.0
-    information = 0.5 * (information + information.T) / max(1.0, chi2, shared)
+    by_chance = chi2.isf(_CHANCE, max(found.degrees, 1.0)) / max(found.degrees, 1.0)
+    shared = found.scatter if found.scatter > by_chance else 1.0
+    information = 0.5 * (information + information.T) / max(1.0, reduced, shared)
     return Adjustment(
         parameters.model(theta, with_rim=True), theta, poses, information,
-        posterior(information, parameters.spread), gain, terms.residual, inlier, scale, chi2,
+        posterior(information, parameters.spread), gain, terms.residual, inlier, scale, reduced,
         shared, ended and finished, used)
 
 

@@ -37,11 +37,14 @@ class PullStatistics:
     :ivar freedom: how many parts those are.
     :ivar scatter: squared scatter of the single pulls over that of noise as told, 1 if it is as
         told, once the step that the sum asks for is taken.
+    :ivar degrees: degrees of freedom of a chi-square that scatters as much, over their number,
+        as ``scatter`` does by chance.
     """
 
     squared: float
     freedom: int
     scatter: float
+    degrees: float
 
 
 def pull_statistics(slopes: Array, curvatures: Array, spread: Array) -> PullStatistics:
@@ -54,13 +57,19 @@ def pull_statistics(slopes: Array, curvatures: Array, spread: Array) -> PullStat
     seen = values > 1.0
     freedom = int(seen.sum())
     if not freedom:
-        return PullStatistics(0.0, 0, 1.0)
+        return PullStatistics(0.0, 0, 1.0, 0.0)
     units = spread[:, None] * vectors[:, seen] / np.sqrt(values[seen])
     pulls = slopes @ units
     shares = np.einsum('pi,kpq,qj->kij', units, curvatures, units)
     total = pulls.sum(axis=0)
     left = pulls - shares @ total
     # A frame that alone fixes some part has that part of its pull taken away by the step.
-    expected = freedom - float(np.sum(shares**2))
+    expected = max(freedom - float(np.sum(shares**2)), 1e-3 * freedom)
+    # What is left of frames k and l covaries as delta_kl S_k - S_k S_l, S their shares; the sum of
+    # the squares has twice the squared norm of all that for its variance.
+    squares = shares @ shares
+    together = squares.sum(axis=0)
+    norm = float(np.sum(shares**2) - 2.0 * np.sum(squares * shares) + np.sum(together**2))
     return PullStatistics(
-        float(total @ total), freedom, float(np.sum(left**2)) / max(expected, 1e-3 * freedom))
+        float(total @ total), freedom, float(np.sum(left**2)) / expected,
+        expected**2 / max(norm, 1e-12))
