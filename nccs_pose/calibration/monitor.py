@@ -31,7 +31,8 @@ Feed it every answer of the localiser, whatever its state, and ask when the diag
         warn(verdict.words)  # 'residuals suggest the mirror moved by about 0.3 mm ...'
 
 :meth:`CalibrationMonitor.add` takes a millisecond or two, :meth:`CalibrationMonitor.verdict`
-about one; :meth:`CalibrationMonitor.reset` when the rig or the map is another.
+about one, or fifty when it suspects; :meth:`CalibrationMonitor.reset` when the rig or the map is
+another.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.pulls import pull_statistics
+from nccs_pose.errors import GeometryError
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -56,8 +58,13 @@ from nccs_pose.options import check_options, option
 import numpy as np
 from scipy.stats import f as fisher
 
-_CAUCHY = 2.385
+_GATE = 4.0  # robust standard deviations of a frame
 _LEAST_LINES = 2
+_LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
+# By so many places, and points of each line, the parts that may have moved are told apart.
+_WITNESSES, _WITNESS_POINTS = 16, 20
+_STEPS = 3
+_HELD = 1e-12  # spread of what is held, in any unit
 
 
 @dataclass(frozen=True)
@@ -119,13 +126,15 @@ class Verdict:
 class _Place:
     """The mean of what frames from one place say.
 
-    :ivar pose: of the first of them (3,).
+    :ivar frame: the first of them, what is no outlier, thinned.
+    :ivar pose: its pose (3,).
     :ivar information: I (P, P).
     :ivar slope: g (P,).
     :ivar gain: -dpose/dtheta (3, P).
     :ivar frames: how many.
     """
 
+    frame: FrameObservation
     pose: Array
     information: Array
     slope: Array
@@ -162,14 +171,15 @@ class CalibrationMonitor:
         self._asked = self._mute = 0
 
     def add(self, estimate: Estimate) -> None:
-        """Look at one answer of the localiser; poses on two lines count, doubted ones too."""
-        pose, points = estimate.pose, estimate.points
+        """Look at one answer of the localiser: a pose on two lines, or a doubted one on three."""
+        pose, points, least = estimate.pose, estimate.points, _LEAST_LINES
         if estimate.state is not State.TRACKING and estimate.doubted is not None:
             pose, points = estimate.doubted.pose, estimate.doubted.points
-        if pose is None or not points:
+            least = _LEAST_DOUBTED
+        points = points[points.label >= 0] if points else None
+        if pose is None or not points or len(np.unique(points.label)) < least:
             self._asked, self._mute = self._asked + 1, self._mute + 1
             return
-        points = points[points.label >= 0]
         self.add_frame(FrameObservation(
             estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8)), pose)
 
@@ -178,8 +188,8 @@ class CalibrationMonitor:
         self._asked += 1
         if len(frame.lines) < _LEAST_LINES:
             return
-        observations = Observations.stack(
-            [frame.thinned(self.options.points_per_line)], self._parameters.rough.line_map)
+        frame = frame.thinned(self.options.points_per_line)
+        observations = Observations.stack([frame], self._parameters.rough.line_map)
         problem = Problem(self._parameters, observations, check=False)
         here, as_told = pose.as_array(), np.zeros(len(self._parameters))
         problem.drop_feet(as_told, here[None])
@@ -187,13 +197,17 @@ class CalibrationMonitor:
         if terms.hit.sum() < 12:
             return
         scale = max(1.0, 1.4826 * float(np.median(np.abs(terms.residual[terms.hit]))))
-        weight = terms.hit / (1.0 + (terms.residual / (_CAUCHY * scale)) ** 2)
-        system = ArrowSystem.of(terms, weight, problem.slices)
+        # Least squares over what is no outlier: a weight that falls with the residual would make
+        # the step that the pulls ask for too short.
+        inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
+        system = ArrowSystem.of(terms, inlier.astype(float), problem.slices)
         information, slope, gain = system.reduced()
         if self._places and same_place(here, self._places[-1].pose):
             self._places[-1].average(information, slope, gain[0])
         else:
-            self._places.append(_Place(here, information, slope, gain[0]))
+            witness = FrameObservation(
+                frame.stamp_ns, frame.points[inlier], frame.side[inlier]).thinned(_WITNESS_POINTS)
+            self._places.append(_Place(witness, here, information, slope, gain[0]))
 
     def verdict(self) -> Verdict:
         """What the frames so far say."""
@@ -207,7 +221,7 @@ class CalibrationMonitor:
         curvatures = np.array([place.information for place in self._places])
         statistic, limit = self._regularity(slopes, curvatures)
         pull, information = slopes.sum(axis=0), curvatures.sum(axis=0)
-        step = self._step(np.ones(len(self._parameters), dtype=bool), pull, information)
+        step = self._step(pull, information)
         error = self._pose_error(step)
         if statistic <= limit:
             words = f'calibration good: residuals from {places} places are noise'
@@ -216,7 +230,7 @@ class CalibrationMonitor:
                      f'{1e3 * error:.1f} mm')
         else:
             return Verdict(
-                Condition.SUSPECT, f'{self._suspicion(pull, information)}; poses are off by up to '
+                Condition.SUSPECT, f'{self._suspicion()}; poses are off by up to '
                 f'about {_significant(1e3 * error)} mm: calibrate again', places, statistic,
                 limit, error)
         return Verdict(Condition.GOOD, words, places, statistic, limit, error)
@@ -231,13 +245,11 @@ class CalibrationMonitor:
             fisher.isf(self.options.false_alarm, found.freedom, len(slopes) - 1))
         return found.squared / max(1.0, found.scatter), limit
 
-    def _step(self, free: Array, pull: Array, information: Array) -> Array:
-        """What change of the free numbers (P,) of the rig the pulls ask for, (P,)."""
-        spread = self._parameters.spread[free]
-        step = np.zeros(len(self._parameters))
-        scaled = information[np.ix_(free, free)] * np.outer(spread, spread) + np.eye(len(spread))
-        step[free] = -spread * np.linalg.solve(scaled, spread * pull[free])
-        return step
+    def _step(self, pull: Array, information: Array) -> Array:
+        """What change of the rig (P,) the pulls ask for."""
+        spread = self._parameters.spread
+        scaled = information * np.outer(spread, spread) + np.eye(len(spread))
+        return np.asarray(-spread * np.linalg.solve(scaled, spread * pull))
 
     def _pose_error(self, step: Array) -> float:
         gains = np.array([place.gain for place in self._places])
@@ -245,18 +257,40 @@ class CalibrationMonitor:
         moved = pose_uncertainty(gains, poses, np.outer(step, step))
         return float(np.hypot(moved.position, moved.base_position))
 
-    def _suspicion(self, pull: Array, information: Array) -> str:
-        """The single part whose move explains the pulls best, and by how much it moved."""
-        groups = {p.group for p in self._parameters.parameters}
-        best, words = -1.0, ''
-        for group in sorted(groups):
+    def _suspicion(self) -> str:
+        """The single part whose move explains the residuals best, and by how much it moved.
+
+        Poses give way to a move, and far enough to bend what is straight for the pulls: here each
+        part is solved for together with the poses.
+        """
+        places = list(self._places)
+        rows = np.linspace(0, len(places) - 1, min(len(places), _WITNESSES)).round().astype(int)
+        observations = Observations.stack(
+            [places[k].frame for k in rows], self._parameters.rough.line_map)
+        problem = Problem(self._parameters, observations, check=False)
+        poses = np.array([places[k].pose for k in rows])
+        least, words = np.inf, ''
+        for group in dict.fromkeys(p.group for p in self._parameters.parameters):
             free = np.array([p.group == group for p in self._parameters.parameters])
-            step = self._step(free, pull, information)
-            explained = -float(pull @ step)
-            if explained > best:
-                size = float(np.linalg.norm(step))
-                best, words = explained, _MOVES[group](size)
+            try:
+                move, left = self._move(problem, poses, free)
+            except GeometryError:
+                continue  # a camera inside the mirror: what moved is something else
+            if left < least:
+                least, words = left, _MOVES[group](float(np.linalg.norm(move)))
         return f'residuals suggest {words}'
+
+    def _move(self, problem: Problem, poses: Array, free: Array) -> tuple[Array, float]:
+        """How far (P,) some numbers moved if nothing else did, and the squares that are left."""
+        spread = np.where(free, self._parameters.spread, _HELD)
+        theta = np.zeros(len(spread))
+        terms = problem.linearise(theta, poses)
+        for _ in range(_STEPS):
+            system = ArrowSystem.of(terms, terms.hit.astype(float), problem.slices)
+            step, pose_step = system.solve(theta, spread, 0.0)
+            theta, poses = theta + step, poses + pose_step
+            terms = problem.linearise(theta, poses)
+        return theta, float(np.sum(terms.residual**2))
 
 
 def _significant(value: float) -> str:
