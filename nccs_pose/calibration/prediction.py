@@ -33,12 +33,13 @@ def predict_frame(
     :param sigma: standard deviation to give them, px; it is not applied.
     :param points: how many of each line, both edges together (a line without a width: all on
         its middle).
-    :param parameter: where along each line (points,), 0 at its start to 1 at its end; None:
-        evenly.
+    :param parameter: where along the lines, 0 at the start to 1 at the end: (points,) for all of
+        them, or (L, points), each its own; None: evenly.
     """
-    along = np.linspace(0.0, 1.0, points) if parameter is None else parameter
+    where = np.linspace(0.0, 1.0, points) if parameter is None else parameter
     world, label, side = [], [], []
-    for index, line in enumerate(line_map):
+    for index, (line, along) in enumerate(
+            zip(line_map, np.broadcast_to(where, (len(line_map), points)))):
         sides = np.where(np.arange(points) % 2, 1, -1) if line.width > 0.0 else np.zeros(points)
         left = np.cross([0.0, 0.0, 1.0], line.direction)
         world.append(line.start + along[:, None] * (line.end - line.start)

@@ -24,12 +24,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import time
 
-from nccs_pose.calibration.adjustment import adjust
+from nccs_pose.calibration.adjustment import adjust, ArrowSystem, posterior
 from nccs_pose.calibration.judgement import frame_residual
 from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
+from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.procedure import calibrate
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.camera import PinholeCamera
@@ -43,7 +44,10 @@ import numpy as np
 from scipy.stats import chi2
 
 Random = np.random.Generator
-_X, _Y = 1.2, 0.8  # where the robot drives in the arena, metres either way
+_X, _Y = 1.4, 0.9  # where the robot drives in the arena, metres either way: 0.4 m off the tapes
+_FRAMES = 20
+_DRIVE = 150  # images that calibrate looks at, of which it chooses
+_COARSE = 33  # steps along a line by which its length in the image is measured
 
 
 def random_pose(rng: Random) -> Pose2:
@@ -55,14 +59,17 @@ def measured_frames(
     rig: Rig, line_map: LineMap, count: int, rng: Random, *, sigma: float = 0.2,
     points: int = 75,
 ) -> tuple[list[FrameObservation], Array]:
-    """Frames of noisy points on the tapes' edges, and their true poses (F, 3)."""
+    """Frames of noisy points on the tapes' edges, and their true poses (F, 3).
+
+    :param points: of each line, evenly spread in the image over what is seen of it.
+    """
     frames: list[FrameObservation] = []
     poses: list[Array] = []
     while len(frames) < count:
         pose = random_pose(rng)
         ideal = predict_frame(
             rig, line_map, pose, sigma=sigma, points=points, stamp_ns=len(frames),
-            parameter=rng.uniform(0.0, 1.0, points))
+            parameter=_even_stations(rig, line_map, pose, points, rng))
         if len(ideal.lines) < 3:
             continue
         noise = sigma * rng.normal(size=ideal.points.pixels.shape)
@@ -70,6 +77,25 @@ def measured_frames(
         frames.append(replace(ideal, points=noisy))
         poses.append(pose.as_array())
     return frames, np.array(poses)
+
+
+def _even_stations(
+    rig: Rig, line_map: LineMap, pose: Pose2, count: int, rng: Random,
+) -> Array:
+    """Where along each line (L, count), 0 to 1, stations stand that are even in the image."""
+    along = np.linspace(0.0, 1.0, _COARSE)
+    world = (line_map.starts[:, None]
+             + along[:, None] * (line_map.ends - line_map.starts)[:, None])
+    pixels, seen = rig.project(pose.inverse().apply(world.reshape(-1, 3)))
+    pixels, seen = pixels.reshape(*world.shape[:2], 2), seen.reshape(world.shape[:2])
+    step = np.linalg.norm(np.diff(pixels, axis=1), axis=2)
+    step = np.where(seen[:, 1:] & seen[:, :-1], step, 0.0)
+    stations = np.zeros((len(line_map), count))
+    for own, length in zip(stations, step):
+        # What is hidden has no length; a tiny one keeps the curve invertible.
+        arc = np.concatenate([[0.0], np.cumsum(length + 1e-9)])
+        own[:] = np.interp((np.arange(count) + rng.uniform()) / count * arc[-1], arc, along)
+    return stations
 
 
 def _vector(rng: Random, size: int, length: float) -> Array:
@@ -172,22 +198,38 @@ def squared_errors(
     return float(np.sum(values[seen] * along**2)), int(seen.sum())
 
 
+def cop_bound(
+    true: Rig, line_map: LineMap, options: CalibrationOptions, frames: Observations, poses: Array,
+) -> Array:
+    """Cramer-Rao bound of the camera's place (y, z), metres, from frames at poses (F, 3)."""
+    parameters = RigParameters(true, line_map, options)
+    problem, theta = Problem(parameters, frames), np.zeros(len(parameters))
+    problem.drop_feet(theta, poses)
+    terms = problem.linearise(theta, poses)
+    system = ArrowSystem.of(terms, terms.hit.astype(float), problem.slices)
+    covariance = posterior(system.reduced()[0], parameters.spread)
+    rows = [parameters.index['cop_y'], parameters.index['cop_z']]
+    return np.asarray(np.sqrt(np.diag(covariance)[rows]))
+
+
 def targets(
-    kinds: Sequence[str], rigs: int, first: int = 0, mounting: bool = True,
+    kinds: Sequence[str], rigs: int, first: int = 0, mounting: bool = True, drive: int = _DRIVE,
 ) -> None:
     """20 frames x 4 lines x 75 px at 0.2 px, each number 0.3 mm or 0.3 degrees off at first.
 
     :param mounting: whether height and tilt are free as well as the camera against the mirror.
+    :param drive: images of which the 20 are chosen (and, beside them, every fifth held out).
     """
     line_map = arena_map()
-    options = CalibrationOptions(height=mounting, tilt=mounting)
+    options = CalibrationOptions(height=mounting, tilt=mounting, max_frames=_FRAMES)
     for kind in kinds:
         before, after, cop, seconds, total, freedom = [], [], [], [], 0.0, 0
+        bound = []
         for seed in range(first, first + rigs):
             rng = np.random.default_rng(seed)
             true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
             rough = off_in_each(true, rng)
-            frames, _ = measured_frames(true, line_map, 25, rng)
+            frames, poses = measured_frames(true, line_map, drive, rng)
             start = time.process_time()
             found = calibrate(rough, line_map, frames, options)
             seconds.append(time.process_time() - start)
@@ -195,20 +237,23 @@ def targets(
             before.append(1e3 * pose_bias(rough, true, line_map, rng).position)
             after.append(1e3 * pose_bias(rig, true, line_map, rng).position)
             cop.append(1e6 * (rig.cop[1:] - true.cop[1:]))
+            used = found.observations
+            bound.append(1e6 * cop_bound(
+                true, line_map, options, used, poses[list(used.stamps_ns)]))
             one, k = squared_errors(
                 result.theta, deviation_of(true, found.parameters), result.information,
                 found.parameters.spread)
             total, freedom = total + one, freedom + k
         low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
         far = np.array(before) > 100.0
-        rms = np.sqrt(np.mean(np.square(cop), axis=0))
+        rms, least = (np.sqrt(np.mean(np.square(e), axis=0)) for e in (cop, bound))
         print(f'{kind}: {rigs} rigs; pose bias, median (worst) {np.median(before):.0f} '
               f'({max(before):.0f}) -> {np.median(after):.3f} ({max(after):.3f}) mm; of the '
               f'{far.sum()} that begin above 100 mm the worst ends at '
               f'{max(np.array(after)[far], default=0.0):.3f} mm; COP rms {rms[0]:.1f} and '
-              f'{rms[1]:.1f} um; chi2 per degree {total / freedom:.3f} of {freedom} (95 % band '
-              f'{low:.3f} to {high:.3f}); CPU {np.median(seconds):.2f} s, worst '
-              f'{max(seconds):.2f} s', flush=True)
+              f'{rms[1]:.1f} um, Cramer-Rao bound {least[0]:.1f} and {least[1]:.1f} um; chi2 per '
+              f'degree {total / freedom:.3f} of {freedom} (95 % band {low:.3f} to {high:.3f}); '
+              f'CPU {np.median(seconds):.2f} s, worst {max(seconds):.2f} s', flush=True)
 
 
 def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
@@ -273,10 +318,12 @@ def main() -> None:
         '--hold-mounting', action='store_true', help='hold height and tilt, of targets')
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--kind', action='append', help='arena, or a rig of Table I; repeatable')
+    parser.add_argument(
+        '--drive', type=int, default=_DRIVE, help='images that the frames are chosen of')
     arguments = parser.parse_args()
     if arguments.study == 'targets':
         targets(arguments.kind or ['arena', *TABLE_ONE], arguments.rigs,
-                arguments.first, not arguments.hold_mounting)
+                arguments.first, not arguments.hold_mounting, arguments.drive)
     elif arguments.study == 'rough':
         rough_starts(arguments.kind or list(TABLE_ONE), arguments.rigs, arguments.first)
     else:
