@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+import contextlib
 import itertools
 import os
 from pathlib import Path
@@ -31,20 +32,35 @@ os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
 _NUMBERS = itertools.count()
 
 
-@pytest.fixture
-def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+@contextlib.contextmanager
+def a_world(folder: Path) -> Iterator[Any]:
     """A DDS domain of its own, with a user in it."""
     pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
     from harness import World
 
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
     # Domains 1 to 99 are safe on every system; neighbours in time and other runs differ.
     domain = 1 + (os.getpid() * 7 + next(_NUMBERS)) % 99
-    world = World(domain, tmp_path)
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_LOG_DIR', str(folder / 'ros_log'))
+        world = World(domain, folder)
+        try:
+            yield world
+        finally:
+            world.close()
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[Any]:
+    """A world for one test."""
+    with a_world(tmp_path) as world:
         yield world
-    finally:
-        world.close()
+
+
+@pytest.fixture(scope='module')
+def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A world in which the tests of a module meet the same nodes: discovery takes seconds."""
+    with a_world(tmp_path_factory.mktemp('world')) as world:
+        yield world
 
 
 @pytest.fixture(scope='session')
