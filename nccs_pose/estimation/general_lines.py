@@ -138,9 +138,9 @@ def all_minima(gram: Array, directions: Array) -> tuple[Minimum, ...]:
 
 def are_horizontal(directions: Array) -> bool:
     """Whether all directions (L, 3) lie in the ground's plane."""
-    return bool((np.abs(directions[:, 2]) <= ALIGNED).all())
+    return float(np.abs(directions[:, 2]).max()) <= ALIGNED
 
 
 def are_vertical(directions: Array) -> bool:
     """Whether all directions (L, 3) stand upright."""
-    return bool((np.abs(directions[:, :2]) <= ALIGNED).all())
+    return float(np.abs(directions[:, :2]).max()) <= ALIGNED

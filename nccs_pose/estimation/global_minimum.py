@@ -81,8 +81,8 @@ _UNCERTAIN = 1e-11
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1
 _NEWTON_STEPS = 8
-# A turn (rad) after which the next is below rounding.
-_LAST_TURN = 1e-7
+# After a turn as small as this (rad) the next one, its square in size, is next to nothing.
+_LAST_TURN = 1e-5
 
 
 def global_minimum(gram: Array, directions: Array) -> Minimum:

@@ -143,11 +143,8 @@ class LabelledRays:
 
     def _lines_in_base(self, pose: Pose2) -> tuple[Array, Array]:
         """Line of each ray in base_link: d' and mu', (3, N) both."""
-        moments = moments_about(np.array([pose.x, pose.y]), self.directions, self.moments)
-        back = pose.rotation.T
-        return (
-            (back @ self.directions.T).take(self.index, axis=1),
-            (back @ moments.T).take(self.index, axis=1))
+        lines = (into_base(pose) @ self.lines.T).take(self.index, axis=1)
+        return lines[:3], lines[3:]
 
     def central_information(self, pose: Pose2) -> Array:
         """Information (3, 3) of a central camera at the viewpoint that sees the same lines.
@@ -179,6 +176,17 @@ class LabelledRays:
         along = (normal * (mu - cosine * w)).sum(axis=0)
         ahead = along > self._nearest * (1.0 - cosine * cosine)
         return float(np.count_nonzero(ahead)) / len(ahead)
+
+
+def into_base(pose: Pose2) -> Array:
+    """The matrix (6, 6) that takes lines (d, mu) from the map into base_link.
+
+    d' = R^T d and mu' = R^T (mu - (x, y, 0) x d).
+    """
+    (c, s, x, y, p, q, _) = monomials(pose).tolist()
+    return np.array([
+        [c, s, 0.0, 0.0, 0.0, 0.0], [-s, c, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, -q, c, s, 0.0], [0.0, 0.0, p, -s, c, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]])
 
 
 def cross_matrix(vector: Array) -> Array:

@@ -32,9 +32,9 @@ from nccs_pose.geometry.pose import Array, Pose2
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1
 _STEPS = 8
-# After a turn as small as this (rad) the next one is below rounding; and at a given yaw the cost
-# is a square in x and y, which one step solves.
-_LAST_TURN = 1e-7
+# After a turn as small as this (rad) the next one, its square in size, is next to nothing; and at
+# a given yaw the cost is a square in x and y, which one step solves.
+_LAST_TURN = 1e-5
 
 
 def minimum_near(gram: Array, directions: Array, pose: Pose2) -> Minimum:
