@@ -56,7 +56,8 @@ from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Pred
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.sifting import Refused, Sifter, Sight
+from nccs_pose.estimation.sifting import Refused, Sifter
+from nccs_pose.estimation.sights import sights
 from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -67,8 +68,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DEFAULTS = LocaliserOptions()
-# A search that leaves less than this unexplained looks no closer.
-_PLAIN = 0.8
 # A pose elsewhere must beat the tracked one by this much to unseat it.
 _BETTER = 0.15
 # Odometry carries a pose on only while it explains this part of what looks like a line, if that is
@@ -243,13 +242,14 @@ class Localiser:
         refused: Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
-        segments, candidates = self._seen(image, watch)
         now = self._odometry.at(stamp_ns)
         hypotheses = carried(self._open, self._open_odometry, now)
-        sifted = self._sifter.sift(
-            Sight(image, segments, candidates, self._fresh_colours()), hypotheses,
-            self._doubts, prediction)
-        watch.lap('measure')
+        for sight in sights(image, self._searcher, self._fresh_colours(), watch.lap):
+            segments = sight.segments
+            sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction)
+            watch.lap('measure')
+            if sifted.held:
+                break
         held = sifted.held
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
@@ -282,24 +282,6 @@ class Localiser:
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
         return self._undecided(stamp_ns, held, watch)
-
-    def _seen(
-        self, image: NDArray[np.uint8], watch: _Stopwatch,
-    ) -> tuple[tuple[FloorSegment, ...], tuple[Candidate, ...]]:
-        """The strips of the look at an image that a pose explains best, and its candidates."""
-        segments: tuple[FloorSegment, ...] = ()
-        candidates: tuple[Candidate, ...] = ()
-        for number, look in enumerate(self._searcher.looks):
-            strips = look(image, segments)
-            watch.lap('detect')
-            poses = self._searcher.candidates(strips)
-            watch.lap('associate')
-            if number == 0 or (poses and (
-                    not candidates or poses[0].score > candidates[0].score)):
-                segments, candidates = strips, poses
-            if candidates and candidates[0].score > _PLAIN:
-                break
-        return segments, candidates
 
     def _trusted(
         self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,

@@ -23,17 +23,14 @@ import math
 from nccs_pose.estimation.alignment import Aligner, Alignment
 from nccs_pose.estimation.association import same_pose
 from nccs_pose.estimation.estimate import Candidate
-from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.vision.colour import LineColour
-import numpy as np
-from numpy.typing import NDArray
 
 # Candidates that are laid on the image.
 _TRIED = 6
@@ -63,22 +60,6 @@ class Sifted:
     held: list[Found]
     hidden: list[Candidate]
     refused: list[Refused]
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """One image that is searched.
-
-    :ivar image: (H, W, 3) uint8 BGR.
-    :ivar segments: the strips in it.
-    :ivar candidates: poses that explain them, best first.
-    :ivar colours: what tapes look like to begin with.
-    """
-
-    image: NDArray[np.uint8]
-    segments: tuple[FloorSegment, ...]
-    candidates: tuple[Candidate, ...]
-    colours: tuple[LineColour, ...]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,85 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One look at an image after the other, until one shows where the robot can be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.search import Searcher
+from nccs_pose.vision.colour import LineColour
+import numpy as np
+from numpy.typing import NDArray
+
+# A best pose with this score leaves nothing to look for; one with half of that is worth a try when
+# the next scores less than this part of it.
+_PLAIN = 0.8
+_RIVAL = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a look at an image shows.
+
+    :ivar image: (H, W, 3) uint8 BGR.
+    :ivar segments: the strips in it.
+    :ivar candidates: poses that explain them, best first.
+    :ivar colours: what tapes look like to begin with.
+    """
+
+    image: NDArray[np.uint8]
+    segments: tuple[FloorSegment, ...]
+    candidates: tuple[Candidate, ...]
+    colours: tuple[LineColour, ...]
+
+    @property
+    def promise(self) -> float:
+        """Score of the best pose, 0 if there is none."""
+        return self.candidates[0].score if self.candidates else 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether one pose is so much better than all others that it is worth a try."""
+        second = self.candidates[1].score if len(self.candidates) > 1 else 0.0
+        return self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise
+
+
+def sights(
+    image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...],
+    lap: Callable[[str], None],
+) -> Iterator[Sight]:
+    """What is worth a try: the first look if it is clear, and then the best of all.
+
+    :param lap: is told the name of each stage that ends.
+    """
+    best: Sight | None = None
+    tried: Sight | None = None
+    for look in searcher.looks:
+        segments = look(image, best.segments if best is not None else ())
+        lap('detect')
+        sight = Sight(image, segments, searcher.candidates(segments), colours)
+        lap('associate')
+        if best is None or sight.promise > best.promise:
+            best = sight
+        if best.promise > _PLAIN:
+            break
+        if tried is None and sight.is_clear:
+            tried = sight
+            yield sight
+    if best is not None and best is not tried:
+        yield best
