@@ -69,7 +69,7 @@ def _found(localiser: Localiser, scene: Scene, k: int) -> bool:
 
 @pytest.mark.parametrize(('colours', 'floor'), [
     (('green',) * 4, 'grey'), (('white',) * 4, 'wood'), (('red',) * 4, 'green'),
-    (('blue',) * 4, 'wood'), (('yellow',) * 4, 'dark'), (MIXED, 'green')])
+    (('blue',) * 4, 'wood'), (('yellow',) * 4, 'dark'), (MIXED, 'green'), (MIXED, 'grey')])
 def test_lines_of_any_colour_are_found_in_any_light(
         colours: tuple[str, ...], floor: str) -> None:
     found = []
