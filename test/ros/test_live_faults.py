@@ -59,6 +59,7 @@ class Robot:
 
     def __init__(self, user: Any, name: str, process: Process, file: Path) -> None:
         self.user, self.node, self.process, self.file = user, f'{name}/localiser', process, file
+        user.meet(process, self.node)
         self.poses = user.listen(PoseWithCovarianceStamped, f'/{name}/pose')
         self.images = user.publisher(Image, f'/{name}/image', self.node)
         self.wheels = user.publisher(Odometry, f'/{name}/odom', self.node)
