@@ -22,7 +22,8 @@ from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import ideal_scene
-from nccs_pose.vision.learned_contrast import learned_weights, weighted
+from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.learned_contrast import feature_of, learned_colour
 from nccs_pose.vision.reduced import ReducedView
 import numpy as np
 import pytest
@@ -70,32 +71,53 @@ def test_what_is_no_floor_has_no_blobs() -> None:
     assert len(view.blobs(~view.region, 400).pixels) == 0
 
 
-def test_weights_are_learned_that_part_tape_from_clutter() -> None:
-    """The floor varies in brightness, the tape differs in red: the weights look for red alone."""
+def _shown(step: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """A floor that varies in brightness, with a tape that differs in red, and half of its pixels.
+
+    :param step: how much redder the tape is, grey levels.
+    """
     rng = np.random.default_rng(1)
     shade = 12.0 * rng.standard_normal((120, 160, 1))
     image = np.clip(np.rint(140.0 + shade + rng.standard_normal((120, 160, 3))), 0, 255)
-    image[60:62, 20:120, 2] += 25.0
-    image[60:62, 20:120, :2] -= 5.0
-    image = image.astype(np.uint8)
-    tape = np.nonzero(np.pad(np.ones((2, 50), np.intp), ((60, 58), (20, 90))))
-    weights = learned_weights(image, tape, np.full((120, 160), 255, np.uint8), 15)
-    assert weights is not None
+    image[60:62, 20:120] += np.array([-0.2, -0.2, 1.0]) * step
+    return image.astype(np.uint8), np.nonzero(
+        np.pad(np.ones((2, 50), np.intp), ((60, 58), (20, 90))))
+
+
+FLOOR = np.full((120, 160), 255, np.uint8)
+
+
+def test_a_colour_is_learned_that_parts_tape_from_clutter() -> None:
+    image, tape = _shown(25.0)
+    red = LineColour.nominal('red', 0.7)
+    learned = learned_colour(red, image, tape, FLOOR, 15)
+    # Shade tells nothing: the weights look for red against the mean of the others.
+    weights = learned.discriminant
     assert abs(weights.sum()) < 0.1 * np.abs(weights).max()
-    assert weights[2] > 0.0
-    feature = weighted(image, weights).astype(float)
+    # The surroundings hold some of the tape.
+    part = learned.contrast @ [-0.2, -0.2, 1.0] / (25.0 * 1.08)
+    assert 0.75 < part < 1.0
+    assert learned.blur == red.blur
+    feature = feature_of(image, learned).astype(float)
     # The half of the tape that was not shown stands out of the floor as the other does.
     other, floor = feature[60:62, 80:120], feature[:50]
     assert other.mean() - floor.mean() > 5.0 * floor.std()
 
 
+@pytest.mark.parametrize(('step', 'colour'), [(25.0, 'green'), (-25.0, 'red'), (0.0, 'red')])
+def test_what_does_not_show_the_colour_teaches_nothing(step: float, colour: str) -> None:
+    image, tape = _shown(step)
+    known = LineColour.nominal(colour, 0.7)
+    assert learned_colour(known, image, tape, FLOOR, 15) is known
+
+
 def test_without_any_floor_beside_the_tape_nothing_is_learned() -> None:
     image = np.full((30, 30, 3), 100, np.uint8)
-    tape = (np.arange(30), np.arange(30))
-    assert learned_weights(image, tape, np.zeros((30, 30), np.uint8), 15) is None
+    tape, red = (np.arange(30), np.arange(30)), LineColour.nominal('red', 0.7)
+    assert learned_colour(red, image, tape, np.zeros((30, 30), np.uint8), 15) is red
 
 
-@pytest.mark.parametrize(('quality', 'least'), [(50, 7), (20, 4)])
+@pytest.mark.parametrize(('quality', 'least'), [(50, 9), (20, 7)])
 def test_a_first_pose_is_found_in_coarse_jpegs(quality: int, least: int) -> None:
     """Chroma of half the size, quantised until thin tapes have next to none."""
     scene = ideal_scene(640, 0.02)

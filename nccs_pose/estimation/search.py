@@ -25,7 +25,8 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.vision.learned_contrast import learned_weights, weighted
+from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.learned_contrast import feature_of, learned_colour
 from nccs_pose.vision.reduced import ReducedView
 from nccs_pose.vision.segment import brightness, chromatic_mask, hsv_mask, Mask, raised_mask
 import numpy as np
@@ -39,14 +40,16 @@ _WIDTH = 320
 _LEAST_WINDOW = 5
 
 Strips = tuple[FloorSegment, ...]
-Look = Callable[[NDArray[np.uint8], Strips], Strips]
+Colours = tuple[LineColour, ...]
+Look = Callable[[NDArray[np.uint8], Strips, Colours], tuple[Strips, Colours]]
 
 
 class Searcher:
     """Finds line-like strips in images and the poses that explain them, for one rig and map.
 
-    :ivar looks: ways to find the strips of an image, the one that suffices for most images first;
-        each may make use of strips that were found before.
+    :ivar looks: ways to find the strips of an image, the one that suffices for most images first.
+        Each takes the strips found before and what the tapes were thought to look like, and gives
+        its own of both.
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
@@ -63,10 +66,10 @@ class Searcher:
         self._view = ReducedView.of(table.region, pitch)
         self._closer = ReducedView.of(table.region, max(pitch // 2, 1))
         self.looks: tuple[Look, ...] = (
-            lambda image, _: self.segments(image),
+            lambda image, _, colours: (self.segments(image), colours),
             self._look_by_example,
             # A tape no brighter than the pattern of its floor shows in a sharp image only.
-            lambda image, _: self._look(image, self._closer))
+            lambda image, _, colours: (self._look(image, self._closer), colours))
         if by_hsv:
             self.looks = self.looks[:1]
 
@@ -75,31 +78,34 @@ class Searcher:
         return self._look(image, self._view)
 
     def _look(self, image: NDArray[np.uint8], view: ReducedView) -> Strips:
-        options, part = self._options, view.read(image)
-        if options.threshold == 'hsv':
-            masks = {colour: hsv_mask(part, colour) for colour in self._widths}
-        else:
-            masks = {
-                colour: chromatic_mask(
-                    part, colour, options.noise_gate, options.least_contrast, self._window(view))
-                for colour in self._widths}
-        return self._strips(masks, view)
+        part = view.read(image)
+        return self._strips({c: self._mask(part, c, view) for c in self._widths}, view)
 
-    def _look_by_example(self, image: NDArray[np.uint8], known: Strips) -> Strips:
+    def _mask(self, part: NDArray[np.uint8], colour: str, view: ReducedView) -> Mask:
+        options = self._options
+        if options.threshold == 'hsv':
+            return hsv_mask(part, colour)
+        return chromatic_mask(
+            part, colour, options.noise_gate, options.least_contrast, self._window(view))
+
+    def _look_by_example(
+        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+    ) -> tuple[Strips, Colours]:
         """Look for what looks like the strips that are known."""
         options, view = self._options, self._view
         part, window = view.read(image), self._window(view)
-        masks: dict[str, Mask] = {}
-        for colour in self._widths:
-            examples = [strip.pixels for strip in known if strip.colour == colour]
-            weights = learned_weights(
-                part, view.places(np.concatenate(examples)), view.region, window,
-            ) if examples else None
-            if weights is not None:
-                masks[colour] = raised_mask(
-                    weighted(part, weights), brightness(part), options.noise_gate,
-                    options.least_contrast, window)
-        return self._strips(masks, view)
+        masks, learned = {}, []
+        for colour in colours:
+            examples = [strip.pixels for strip in known if strip.colour == colour.name]
+            seen = colour if not examples else learned_colour(
+                colour, part, view.places(np.concatenate(examples)), view.region, window)
+            learned.append(seen)
+            masks[colour.name] = self._mask(part, colour.name, view) if seen is colour else (
+                raised_mask(feature_of(part, seen), brightness(part), options.noise_gate,
+                            options.least_contrast, window))
+        if all(seen is colour for seen, colour in zip(learned, colours)):
+            return known, colours
+        return self._strips(masks, view), tuple(learned)
 
     def _window(self, view: ReducedView) -> int:
         return max(_LEAST_WINDOW, self._options.window // view.pitch)

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -53,33 +53,41 @@ class Sight:
         return self.candidates[0].score if self.candidates else 0.0
 
     @property
-    def is_clear(self) -> bool:
-        """Whether one pose is so much better than all others that it is worth a try."""
+    def is_promising(self) -> bool:
+        """Whether the best pose leaves little to look for, or is far better than all others."""
         second = self.candidates[1].score if len(self.candidates) > 1 else 0.0
-        return self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise
+        return self.promise > _PLAIN or (
+            self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise)
 
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...],
     lap: Callable[[str], None],
 ) -> Iterator[Sight]:
-    """What is worth a try: the first look if it is clear, and then the best of all.
+    """What is worth a try: every look that is promising, and at last the best if none was.
+
+    What is given is to be tried before the next is asked for.
 
     :param lap: is told the name of each stage that ends.
     """
     best: Sight | None = None
-    tried: Sight | None = None
+    tried: list[Sight] = []
     for look in searcher.looks:
-        segments = look(image, best.segments if best is not None else ())
+        segments, shown = look(image, best.segments if best is not None else (), colours)
+        if best is not None and segments is best.segments:
+            continue
         lap('detect')
-        sight = Sight(image, segments, searcher.candidates(segments), colours)
+        sight = Sight(image, segments, searcher.candidates(segments), shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
-        if best.promise > _PLAIN:
-            break
-        if tried is None and sight.is_clear:
-            tried = sight
+        elif shown is not colours:
+            # What tapes look like was learned, if not more of them found.
+            sight = best = replace(best, colours=shown)
+        if sight.is_promising:
+            tried.append(sight)
             yield sight
-    if best is not None and best is not tried:
+        if len(tried) > 1 and best.promise > _PLAIN:
+            return
+    if best is not None and best not in tried:
         yield best

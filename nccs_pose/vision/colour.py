@@ -104,11 +104,17 @@ class LineColour:
             return self
         weight = power * good
         contrast = weight @ height / weight.sum()
+        return self.taught(contrast, clutter[good].mean(axis=0), floor)
+
+    def taught(self, contrast: Array, clutter: Array, floor: Array) -> LineColour:
+        """Take over a contrast (3,) to a floor's colour (3,), unless it is not of this class.
+
+        :param clutter: covariance of the floor (3, 3), grey levels^2.
+        """
         if self._unlike(contrast, floor) or float(contrast @ contrast) < _LEAST_CONTRAST**2:
             return self
         # One grey level of rounding keeps a noise-free image from a singular covariance.
-        return replace(
-            self, contrast=contrast, clutter=clutter[good].mean(axis=0) + 0.1 * np.eye(3))
+        return replace(self, contrast=contrast, clutter=clutter + 0.1 * np.eye(3))
 
     def _unlike(self, contrast: Array, floor: Array) -> bool:
         """Whether a contrast (3,) to a floor's colour (3,) is another class's.

@@ -22,7 +22,7 @@ compression has left no colour of a thin tape.
 from __future__ import annotations
 
 import cv2
-from nccs_pose.geometry.pose import Array
+from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.segment import Mask
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +36,14 @@ _ORDINARY = 90.0
 _ROUNDING = 4.0
 
 
-def learned_weights(
-    image: NDArray[np.uint8], tape: tuple[NDArray[np.intp], NDArray[np.intp]], floor: Mask,
-    window: int,
-) -> Array | None:
-    """Fisher's weights (3,) on B, G, R for tape against floor; None where no floor is left.
+def learned_colour(
+    colour: LineColour, image: NDArray[np.uint8],
+    tape: tuple[NDArray[np.intp], NDArray[np.intp]], floor: Mask, window: int,
+) -> LineColour:
+    """What a colour is in an image; the colour as it was where that cannot be told.
 
     :param image: (H, W, 3) uint8 BGR.
-    :param tape: rows and columns (N,) of pixels on tapes.
+    :param tape: rows and columns (N,) of pixels on tapes of the colour.
     :param floor: (H, W), not 0 where there is floor.
     :param window: width of the surroundings, px.
     """
@@ -52,19 +52,22 @@ def learned_weights(
     on_tape = np.zeros(floor.shape, np.uint8)
     on_tape[tape] = 255
     beside = cv2.bitwise_and(floor, cv2.bitwise_not(cv2.dilate(on_tape, _NEAR)))
-    clutter = values[::_SPARSE, ::_SPARSE][beside[::_SPARSE, ::_SPARSE] > 0].astype(float)
+    sparse = beside[::_SPARSE, ::_SPARSE] > 0
+    clutter = values[::_SPARSE, ::_SPARSE][sparse].astype(float)
     if len(clutter) == 0:
-        return None
+        return colour
     size = np.square(clutter).sum(axis=1)
     clutter = clutter[size <= np.percentile(size, _ORDINARY)]
-    weights = np.linalg.solve(
+    return colour.taught(
+        values[tape].mean(axis=0).astype(float),
         clutter.T @ clutter / len(clutter) + _ROUNDING * np.eye(3),
-        values[tape].mean(axis=0).astype(float))
-    return np.asarray(2.0 * weights / max(float(np.abs(weights).sum()), 1e-9))
+        np.median(image[::_SPARSE, ::_SPARSE][sparse], axis=0))
 
 
-def weighted(image: NDArray[np.uint8], weights: Array) -> Mask:
-    """The weighted sum of channels (H, W) uint8, 128 where the floor is as usual."""
+def feature_of(image: NDArray[np.uint8], colour: LineColour) -> Mask:
+    """How much each pixel is like tape (H, W) uint8, 128 where the floor is as usual."""
     usual = np.median(image[::8, ::8].reshape(-1, 3), axis=0)
+    weights = colour.discriminant
+    weights = 2.0 * weights / float(np.abs(weights).sum())
     return np.asarray(cv2.transform(
         image, np.append(weights, 128.0 - weights @ usual)[None].astype(np.float32)))
