@@ -27,8 +27,9 @@ Below a pixel of noise, where the localiser works, it changes nothing.
 
 from __future__ import annotations
 
+from nccs_pose.estimation.labelled_rays import into_base
+from nccs_pose.estimation.pose_monomials import with_derivatives
 from nccs_pose.estimation.refine import refine, Refinement
-from nccs_pose.estimation.residual import lines_in_base, side, side_gradient
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays, Rig
 import numpy as np
@@ -41,6 +42,7 @@ def refine_in_image(
     moments: Array,
     start: Pose2,
     *,
+    rays: Rays | None = None,
     sigma: float = 1.0,
     sigma_world: float = 0.0,
 ) -> Refinement:
@@ -50,37 +52,50 @@ def refine_in_image(
     :param directions: unit directions of the lines in the map (N, 3).
     :param moments: their moments (N, 3), metres.
     :param start: where to begin, T_map_base.
+    :param rays: those of the pixels, where they are at hand.
     :param sigma: standard deviation of the pixels in u and in v, px.
     :param sigma_world: standard deviation of the lines' own position, metres.
     :raises EstimationError: as :func:`nccs_pose.estimation.refine.refine` does.
     """
-    rays = rig.back_project(pixels)
+    if rays is None:
+        rays = rig.back_project(pixels)
     refined = refine(rays, directions, moments, start, sigma=sigma, sigma_world=sigma_world)
-    places = _likely_places(
-        rig, pixels, rays, directions, moments, refined.pose, sigma, sigma_world)
-    rays = _to_first_order(rig.back_project(places), pixels - places)
+    lines = into_base(refined.pose) @ np.concatenate([directions, moments], axis=1).T
+    places = pixels - _offsets(rays, lines, sigma, sigma_world)
+    rays = _to_first_order(rig.back_project(places), pixels - places, rays)
     return refine(rays, directions, moments, refined.pose, sigma=sigma, sigma_world=sigma_world)
 
 
-def _likely_places(
-    rig: Rig, pixels: Array, rays: Rays, directions: Array, moments: Array, pose: Pose2,
-    sigma: float, sigma_world: float,
-) -> Array:
-    """Where (N, 2) the lines are most likely seen, of which the pixels are noisy."""
-    g = side_gradient(rays, directions, moments, pose)
-    s = side(rays, directions, moments, pose)
-    d, _ = lines_in_base(directions, moments, pose)
-    across = np.cross(rays.direction, d)
-    variance = (sigma**2 * np.einsum('ni,ni->n', g, g)
-                + sigma_world**2 * np.einsum('ni,ni->n', across, across))
-    moved = pixels - sigma**2 * g * (s / np.maximum(variance, 1e-30))[:, None]
-    # a place beside the mirror has no ray
-    return np.where(rig.mirror_points(moved)[1][:, None], moved, pixels)
+def _offsets(rays: Rays, lines: Array, sigma: float, sigma_world: float) -> Array:
+    """How far (N, 2) the pixels are from where their lines are most likely seen.
+
+    :param lines: (d, mu) in base_link, one for each ray (6, N).
+    """
+    # S of a ray is r mu + w d; that of its derivatives is the gradient of S.
+    coordinates = with_derivatives(rays)
+    s, *gradient = (coordinates * np.roll(lines, 3, axis=0)[:, None]).sum(axis=0)
+    g = np.array(gradient)
+    variance = sigma**2 * (g * g).sum(axis=0)
+    if sigma_world > 0.0:
+        cosine = (coordinates[:3, 0] * lines[:3]).sum(axis=0)
+        variance += sigma_world**2 * (1.0 - cosine * cosine)
+    return (g * (sigma**2 * s / np.maximum(variance, 1e-30))).T
 
 
-def _to_first_order(rays: Rays, offset: Array) -> Rays:
-    """The rays (N,) that pixels at some offset (N, 2) have to first order."""
-    return Rays(
-        rays.direction + np.einsum('nij,nj->ni', rays.direction_jacobian, offset),
-        rays.moment + np.einsum('nij,nj->ni', rays.moment_jacobian, offset),
-        rays.direction_jacobian, rays.moment_jacobian, rays.hit)
+def _to_first_order(rays: Rays, offset: Array, otherwise: Rays) -> Rays:
+    """The rays (N,) that pixels at some offset (N, 2) have to first order.
+
+    :param otherwise: their own rays, for where there is none to begin with.
+    """
+    direction, moment = (
+        value + jacobian[..., 0] * offset[:, :1] + jacobian[..., 1] * offset[:, 1:]
+        for value, jacobian in (
+            (rays.direction, rays.direction_jacobian), (rays.moment, rays.moment_jacobian)))
+    found = direction, moment, rays.direction_jacobian, rays.moment_jacobian
+    if not rays.hit.all():
+        # A place beside the mirror has no ray.
+        own = (otherwise.direction, otherwise.moment, otherwise.direction_jacobian,
+               otherwise.moment_jacobian)
+        for array, instead in zip(found, own):
+            array[~rays.hit] = instead[~rays.hit]
+    return Rays(*found, otherwise.hit)

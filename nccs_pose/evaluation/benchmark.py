@@ -158,7 +158,7 @@ def _work(rig: Rig, data: DataSet) -> dict[str, Callable[[], Any]]:
 
     def in_image() -> None:
         first = solve(rays, d, mu, label)[0].pose
-        refine_in_image(rig, data.pixels, d[label], mu[label], first)
+        refine_in_image(rig, data.pixels, d[label], mu[label], first, rays=rays)
 
     return {
         PAPER: lambda: paper_estimate(rig, data.pixels, d[label], mu[label], data.start),

@@ -120,40 +120,44 @@ class Rig:
         Incident ray v, mirror point m, normal n, reflected ray r = v - 2 n (v.n)/(n.n)
         (the paper's eqs. 8 to 10).
         """
-        v, dv = self.camera.directions_with_jacobian(np.asarray(pixels, dtype=float))
-        v = v @ self.R_mirror_camera.T
-        dv = np.matmul(self.R_mirror_camera, dv)
-        m, hit = self.mirror.intersect(self.cop, v)
-        n = self.mirror.normal(m)
-        # Rows that miss are computed with harmless numbers and blanked at the end.
-        vn = np.where(hit, np.einsum('ni,ni->n', v, n), 1.0)
-        nn = np.where(hit, np.einsum('ni,ni->n', n, n), 1.0)
-        r = v - (2.0 * vn / nn)[:, None] * n
+        seen, slopes = self.camera.directions_with_jacobian(np.asarray(pixels, dtype=float))
+        # Components first, then value and derivatives by u and v, (3, 3, N): what is done to all
+        # pixels lies in one piece.
+        v: Array = np.empty((3, 3, len(seen)))
+        v[:, 0], v[:, 1:] = seen.T, slopes.transpose(1, 2, 0)
+        v = (self.R_mirror_camera @ v.reshape(3, -1)).reshape(v.shape)
+        points, hit = self.mirror.intersect(self.cop, v[:, 0].T)
+        m, n = np.empty_like(v), np.empty_like(v)
+        m[:, 0], n[:, 0] = points.T, self.mirror.normal(points).T
         # m = o + t v stays on the surface: n . dm = 0.
-        t = np.linalg.norm(m - self.cop, axis=1)
-        along = np.einsum('ni,nij->nj', n, dv) / vn[:, None]
-        dm = t[:, None, None] * (dv - v[:, :, None] * along[:, None, :])
-        dn = dm.copy()
-        dn[:, 2] *= self.mirror.A
-        d_vn = np.einsum('ni,nij->nj', n, dv) + np.einsum('ni,nij->nj', v, dn)
-        d_nn = 2.0 * np.einsum('ni,nij->nj', n, dn)
-        k = vn / nn
-        dk = (d_vn - k[:, None] * d_nn) / nn[:, None]
-        dr = dv - 2.0 * (n[:, :, None] * dk[:, None, :] + k[:, None, None] * dn)
-        return self._rays_in_base(m, dm, r, dr, hit)
+        vn = (v * n[:, :1]).sum(axis=0)
+        # Rows that miss are computed with harmless numbers and blanked at the end.
+        vn[0] = np.where(hit, vn[0], 1.0)
+        t = np.sqrt(np.square(m[:, 0] - self.cop[:, None]).sum(axis=0))
+        m[:, 1:] = t * (v[:, 1:] - v[:, :1] * (vn[1:] / vn[0]))
+        n[:, 1:] = m[:, 1:]
+        n[2, 1:] *= self.mirror.A
+        # k = 2 (v.n) / (n.n) and its derivatives.
+        vn[1:] += (v[:, :1] * n[:, 1:]).sum(axis=0)
+        nn = (n * n[:, :1]).sum(axis=0)
+        nn[0] = np.where(hit, nn[0], 1.0)
+        k = 2.0 * vn[0] / nn[0]
+        dk = 2.0 * (vn[1:] - k * nn[1:]) / nn[0]
+        r = v - k * n
+        r[:, 1:] -= n[:, :1] * dk
+        return self._rays_in_base(m, r, hit)
 
-    def _rays_in_base(
-        self, m: Array, dm: Array, r: Array, dr: Array, hit: NDArray[np.bool_],
-    ) -> Rays:
-        rotation = self.T_base_mirror.rotation
-        m, r = self.T_base_mirror.apply(m), self.T_base_mirror.rotate(r)
-        dm, dr = np.matmul(rotation, dm), np.matmul(rotation, dr)
-        w = np.cross(m, r)
-        dw = np.cross(dm, r[:, :, None], axis=1) + np.cross(m[:, :, None], dr, axis=1)
+    def _rays_in_base(self, m: Array, r: Array, hit: NDArray[np.bool_]) -> Rays:
+        """From points and directions in the mirror's frame, with their derivatives (3, 3, N)."""
+        m, r = (
+            (self.T_base_mirror.rotation @ a.reshape(3, -1)).reshape(a.shape) for a in (m, r))
+        m[:, 0] += self.T_base_mirror.translation[:, None]
+        w = _cross(m[:, :1], r)
+        w[:, 1:] += _cross(m[:, 1:], r[:, :1])
         if not hit.all():
-            for array in (r, w, dr, dw):
-                array[~hit] = 0.0
-        return Rays(r, w, dr, dw, hit)
+            r[..., ~hit] = w[..., ~hit] = 0.0
+        return Rays(
+            r[:, 0].T, w[:, 0].T, r[:, 1:].transpose(2, 0, 1), w[:, 1:].transpose(2, 0, 1), hit)
 
     def project(self, points: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels (N, 2) of points (N, 3) in base_link, and which are seen in the image (N,).
@@ -165,3 +169,9 @@ class Rig:
         pixels, in_front = self.camera.project((m - self.cop) @ self.R_mirror_camera)
         seen = visible & in_front
         return np.where(seen[:, None], pixels, 0.0), seen & self.camera.contains(pixels)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products of vectors whose components come first (3, ...)."""
+    return np.stack([
+        a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
