@@ -86,12 +86,12 @@ class ProfileFit:
 
 
 def _read_pixels(
-    image: NDArray[np.uint8], bands: Bands, margin: float, density: float,
+    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """The pixels nearest to a grid over each band: values (N, P, 3) and place across s (N, P), px.
 
     :param margin: beyond the edges, px.
-    :param density: of the grid along the curve, per px.
+    :param rows: of the grid along each station's piece of curve.
     """
     # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
     # across for its real part and the one along (backwards) for its imaginary part.
@@ -100,9 +100,8 @@ def _read_pixels(
     bend = (0.5 * bands.bend).astype(np.float32)[:, None]
     half_band = (bands.half_width + margin).astype(np.float32)
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    m = max(min(round(density * float(bands.spacing.mean())), _MOST_ALONG), 1)
     t = bands.spacing.astype(np.float32)[:, None] * (
-        (np.arange(m, dtype=np.float32) + 0.5) / m - 0.5)
+        (np.arange(rows, dtype=np.float32) + 0.5) / rows - 0.5)
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
     on_curve = (bend * t * t - 1j * t) * across
     arm = (half_band[:, None] * np.linspace(-1.0, 1.0, k, dtype=np.float32)) * across
@@ -110,9 +109,9 @@ def _read_pixels(
     pixels = at.view(np.float32)
     np.rint(pixels, out=pixels)
     n = len(bands)
-    values = cv2.remap(image, pixels.reshape(n, m * k, 2), None, cv2.INTER_NEAREST,
+    values = cv2.remap(image, pixels.reshape(n, rows * k, 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
-    at = at.reshape(n, m * k)
+    at = at.reshape(n, rows * k)
     at -= centre[:, None]
     at *= across.conj()
     s = np.square(at.imag)
@@ -212,7 +211,8 @@ def fit_profiles(
     margin = _MARGIN_PX + _MARGIN_BLURS * blur
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
-    pixels, s = _read_pixels(image, bands, margin, density)
+    rows = max(min(round(density * float(bands.spacing.mean())), _MOST_ALONG), 1)
+    pixels, s = _read_pixels(image, bands, margin, rows)
     products, floor = _products(pixels, s, bands.half_width, blur)
     groups, count = _Groups.of(bands), s.shape[1]
     pooled = np.add.reduceat(products, groups.first, axis=0)
@@ -223,9 +223,9 @@ def fit_profiles(
     if not rough:
         colour = colour.learn(
             system.height, system.power, system.left / (size - 4)[:, None, None], floor)
-    # Where the grid is finer than the pixels, each of them is counted several times.
-    repeats = np.maximum(
-        count / (bands.spacing * 2.0 * (bands.half_width + margin)), 1.0)
+    # Where the grid is finer than the pixels, across or along, each is counted several times.
+    repeats = np.maximum(rows / bands.spacing, 1.0) * np.maximum(
+        count / rows / (2.0 * (bands.half_width + margin)), 1.0)
     fit, shared = _shifts(
         products, means, system, colour.discriminant, groups, size, bands, repeats)
     # A template beside its tape would take the misfit for blur.
