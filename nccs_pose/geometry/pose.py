@@ -48,11 +48,13 @@ class Pose2:
     yaw: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(v) for v in (self.x, self.y, self.yaw)):
-            raise GeometryError(f'pose ({self.x}, {self.y}, {self.yaw}) is not finite')
-        object.__setattr__(self, 'x', float(self.x))
-        object.__setattr__(self, 'y', float(self.y))
-        object.__setattr__(self, 'yaw', float(wrap_angle(self.yaw)))
+        x, y, yaw = float(self.x), float(self.y), float(self.yaw)
+        if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(yaw)):
+            raise GeometryError(f'pose ({x}, {y}, {yaw}) is not finite')
+        object.__setattr__(self, 'x', x)
+        object.__setattr__(self, 'y', y)
+        # As wrap_angle, for one number.
+        object.__setattr__(self, 'yaw', -((-yaw + math.pi) % (2.0 * math.pi) - math.pi))
 
     @classmethod
     def from_array(cls, array: Sequence[float] | Array) -> Pose2:
