@@ -22,7 +22,6 @@ import itertools
 from nccs_pose.estimation.association import (
     global_candidates,
     map_symmetries,
-    misfits,
     same_pose,
     score_pose,
 )
@@ -230,26 +229,28 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
 
 
 def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -> None:
-    line_map = LineMap((_line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5))))
+    line_map = LineMap((
+        _line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5)),
+        _line((-1.0, -1.3), (0.8, -1.2))))
     pose = Pose2(0.2, -0.1, 0.8)
-    strips = _strips(line_map, pose, np.random.default_rng(16), noise=0.0)
-    assert len(strips) == 2
+    strips = _strips(line_map, pose, np.random.default_rng(16), noise=0.02)
+    assert len(strips) == 3
+    # Pixels of strips that are each two of the image wide.
     strips = tuple(replace(strip, pitch=2) for strip in strips)
-    dx, dy = 0.02, -0.03
-    moved = Pose2(pose.x + dx, pose.y + dy, pose.yaw)
-    # The first map line is moved off by dy, the second by dx; a pixel of the image is half of one
-    # of those that the footprint is of.
-    square = sum(
-        s.weight * (off / (0.5 * s.footprint)) ** 2 for s in strips
-        for off in [dy if _lies_on(s, line_map[0], pose) < 0.01 else dx])
-    expected = np.sqrt(square / sum(s.weight for s in strips))
-    there, here, nowhere = misfits(
-        [pose, moved, Pose2(9.0, 9.0, 0.5)], strips, line_map, table)
-    assert there < 1e-6
-    assert here == pytest.approx(expected, rel=1e-6)
-    assert nowhere == np.inf
-    assert misfits([pose], (), line_map, table) == [np.inf]
-    assert misfits([], strips, line_map, table) == []
+    best = global_candidates(strips, line_map, table)[0]
+    square, weight = 0.0, 0.0
+    for strip in strips:
+        share = (np.arange(12) + 0.5)[:, None] / 12
+        points = best.pose.apply(strip.start + share * (strip.end - strip.start))
+        offset = min((
+            np.abs((points - line.start[:2]) @ [-line.direction[1], line.direction[0]])
+            for line in line_map), key=np.mean)
+        square += strip.weight * np.mean((2.0 * offset / strip.footprint) ** 2)
+        weight += strip.weight
+    assert best.misfit > 0.1
+    assert best.misfit == pytest.approx(np.sqrt(square / weight), rel=1e-6)
+    exact = _strips(line_map, pose, np.random.default_rng(16), noise=0.0)
+    assert global_candidates(exact, line_map, table)[0].misfit < 1e-3
 
 
 # ---------------------------------------------------------------- symmetries of maps

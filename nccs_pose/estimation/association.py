@@ -21,7 +21,7 @@ explains the image, best first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.estimate import Candidate
@@ -52,9 +52,19 @@ _SAME_PLACE = 0.25
 _SAME_YAW = 0.15
 
 
+@dataclass(frozen=True)
+class FittedCandidate(Candidate):
+    """A pose that explains strips.
+
+    :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px.
+    """
+
+    misfit: float
+
+
 def global_candidates(
     segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable, most: int = 8,
-) -> tuple[Candidate, ...]:
+) -> tuple[FittedCandidate, ...]:
     """Poses that explain the strips, best first; none where fewer than two strips cross.
 
     A candidate's score is the harmonic mean of two fractions: of the strips' pixels that lie on
@@ -71,7 +81,8 @@ def global_candidates(
         poses = poses[np.argsort(-scorer.claimed(poses), kind='stable')[:_CLOSE]]
         poses = poses[np.argsort(-scorer.score(poses), kind='stable')[:_REFINED]]
     refined = scorer.refine(poses)
-    return _distinct(refined, scorer.score(refined), most)
+    claimed, misfit = scorer.fit(refined)
+    return _distinct(refined, _harmonic(claimed, scorer.explained(refined)), misfit, most)
 
 
 def score_pose(
@@ -88,20 +99,6 @@ def score_pose(
     at = pose.as_array()[None]
     claimed = scorer.claimed(at)
     return float(_harmonic(claimed, scorer.explained(at))[0]), float(claimed[0])
-
-
-def misfits(
-    poses: Sequence[Pose2], segments: tuple[FloorSegment, ...], line_map: LineMap,
-    table: FloorTable,
-) -> list[float]:
-    """How far the strips lie off the lines that poses lay them on, root mean square, px.
-
-    Infinite for a pose that lays none on any line.
-    """
-    if not segments or not poses:
-        return [np.inf] * len(poses)
-    scorer = _Scorer(segments, FloorLines.of(line_map), table)
-    return scorer.misfit(np.array([pose.as_array() for pose in poses])).tolist()
 
 
 def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
@@ -154,11 +151,19 @@ class _Scorer:
         self._tolerance = np.repeat([0.06 + 1.5 * s.footprint for s in segments], _SAMPLES)
         self._pixels_per_metre = np.repeat(
             [s.pitch / max(s.footprint, 1e-9) for s in segments], _SAMPLES)
-        self._segment_start, self._segment_end = starts, ends
-        self._segment_tolerance = np.array([0.06 + 1.5 * s.footprint for s in segments])
+        length = np.hypot(*(ends - starts).T)
+        self._spans = list(zip(
+            starts.tolist(), ((ends - starts) / length[:, None]).tolist(), length.tolist(),
+            [0.06 + 1.5 * s.footprint for s in segments]))
         self._map_points = (
             lines.start[:, None]
-            + (share * lines.length[:, None])[..., None] * lines.direction[:, None])
+            + (share * lines.length[:, None])[..., None] * lines.direction[:, None]
+        ).reshape(-1, 2)
+        # Each sample's neighbours on its line.
+        index = np.arange(_SAMPLES)
+        self._before = np.maximum(index - 1, 0)
+        self._after = np.minimum(index + 1, _SAMPLES - 1)
+        self._between = self._after - self._before
 
     def _on_lines(
         self, poses: Array, step: int = 1,
@@ -193,36 +198,36 @@ class _Scorer:
         weight = self._weight[step // 2::step]
         return on @ weight / weight.sum()
 
-    def misfit(self, poses: Array) -> Array:
-        """Root mean square distance of the samples that lie on lines from these (H,), px."""
+    def fit(self, poses: Array) -> tuple[Array, Array]:
+        """Fraction of the strips' pixels on map lines (H,), and how far off these they are.
+
+        :returns: the fraction, and the root mean square distance (H,), px; 0 if none is on any.
+        """
         on, _, distance = self._on_lines(poses)
         square = np.square(np.where(on, distance, 0.0) * self._pixels_per_metre)
         total = on @ self._weight
-        return np.where(
-            total > 0.0, np.sqrt(square @ self._weight / np.maximum(total, 1e-9)), np.inf)
+        return total / self._weight.sum(), np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
 
     def explained(self, poses: Array) -> Array:
         """Fraction of the map lines in view that strips lie on (H,)."""
-        h = len(poses)
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        flat = self._map_points.reshape(-1, 2)
-        dx, dy = flat[:, 0] - poses[:, :1], flat[:, 1] - poses[:, 1:2]
-        base = np.stack([c[:, None] * dx + s[:, None] * dy, -s[:, None] * dx + c[:, None] * dy], 2)
-        pixels = self._table.pixels(base.reshape(-1, 2))
+        h, points = len(poses), self._map_points
+        c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+        dx, dy = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
+        x, y = c * dx + s * dy, c * dy - s * dx
+        pixels = self._table.pixels(np.column_stack([x.ravel(), y.ravel()]))
         seen = self._table.sees_floor(pixels).reshape(h, -1)
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
-        image = pixels.reshape(h, len(self._lines.length), _SAMPLES, 2)
-        step = np.linalg.norm(np.gradient(image, axis=2), axis=3).reshape(h, -1)
-        weight = seen * np.minimum(step, 60.0)
+        image = pixels.reshape(h, -1, _SAMPLES, 2)
+        step = image[:, :, self._after] - image[:, :, self._before]
+        length = np.hypot(step[..., 0], step[..., 1]) / self._between
+        weight = seen * np.minimum(length.reshape(h, -1), 60.0)
         covered = np.zeros(seen.shape, dtype=bool)
-        for start, end, tolerance in zip(
-                self._segment_start, self._segment_end, self._segment_tolerance):
-            along = (end - start) / np.linalg.norm(end - start)
-            offset = base - start
-            reach = offset @ along
-            across = np.abs(offset @ np.array([-along[1], along[0]]))
-            covered |= ((across < tolerance) & (reach > -BEYOND)
-                        & (reach < np.linalg.norm(end - start) + BEYOND))
+        for start, along, length_, tolerance in self._spans:
+            off_x, off_y = x - start[0], y - start[1]
+            reach = off_x * along[0] + off_y * along[1]
+            across = off_y * along[0] - off_x * along[1]
+            covered |= ((np.abs(across) < tolerance) & (reach > -BEYOND)
+                        & (reach < length_ + BEYOND))
         return (weight * covered).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
 
     def score(self, poses: Array) -> Array:
@@ -252,13 +257,15 @@ def _harmonic(a: Array, b: Array) -> Array:
     return 2.0 * a * b / np.maximum(a + b, 1e-9)
 
 
-def _distinct(poses: Array, score: Array, most: int) -> tuple[Candidate, ...]:
+def _distinct(
+    poses: Array, score: Array, misfit: Array, most: int,
+) -> tuple[FittedCandidate, ...]:
     """The best of each group of poses that are the same."""
-    found: list[Candidate] = []
-    for index in np.argsort(-score, kind='stable'):
+    found: list[FittedCandidate] = []
+    for index in np.argsort(-score, kind='stable').tolist():
         pose = Pose2.from_array(poses[index])
         if all(not same_pose(pose, other.pose) for other in found):
-            found.append(Candidate(pose, float(score[index])))
+            found.append(FittedCandidate(pose, float(score[index]), float(misfit[index])))
         if len(found) == most:
             break
     return tuple(found)

@@ -16,10 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-from nccs_pose.estimation.association import global_candidates, misfits, score_pose
-from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.association import FittedCandidate, global_candidates, score_pose
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.floor_table import FloorTable
@@ -117,13 +116,9 @@ class Searcher:
                 view.blobs(mask, _PIXELS_PER_BLOB), self._table, self._widths[colour], colour))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(self, segments: Strips) -> tuple[Candidate, ...]:
+    def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:
         """Poses that explain the strips, best first."""
         return global_candidates(segments, self._map, self._table)
-
-    def misfits(self, poses: Sequence[Pose2], segments: Strips) -> list[float]:
-        """How far the strips lie off the lines that poses lay them on, root mean square, px."""
-        return misfits(poses, segments, self._map, self._table)
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

@@ -102,12 +102,11 @@ class Sifter:
 
         :param doubts: lines that were seen beside their place and not in it since.
         """
-        options, candidates = self._options, list(sight.candidates[:_TRIED])
+        options = self._options
         starts = [_Start(h.pose, options.band) for h in hypotheses]
-        candidates = [c for c in candidates if c.score >= _WORTH_TRYING * candidates[0].score]
-        off = self._searcher.misfits([c.pose for c in candidates], sight.segments)
         starts += [
-            _Start(c.pose, _SEARCH_BAND, c.score, misfit) for c, misfit in zip(candidates, off)]
+            _Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[:_TRIED]
+            if c.score >= _WORTH_TRYING * sight.promise]
         sifted = Sifted([], [], [])
         seen: list[Pose2] = []
         best: tuple[_Start, Found] | None = None

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.vision.colour import LineColour
@@ -44,7 +44,7 @@ class Sight:
 
     image: NDArray[np.uint8]
     segments: tuple[FloorSegment, ...]
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[FittedCandidate, ...]
     colours: tuple[LineColour, ...]
 
     @property
