@@ -29,7 +29,14 @@ from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.pose_monomials import gram, monomial_rows, monomials, monomials_jacobian
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import side
-from nccs_pose.estimation.small_matrices import inverse_2x2, inverse_3x3, solve_3x3
+from nccs_pose.estimation.small_matrices import (
+    inverse,
+    inverse_2x2,
+    inverse_3x3,
+    solution,
+    solve_3x3,
+    solved,
+)
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.rig import Rays
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -376,3 +383,20 @@ def test_small_matrices_against_lapack(scale, seed):
     line = np.outer(rows[0, :2], rows[0, :2])
     a, b, d = inverse_2x2(line[0, 0], line[0, 1], line[1, 1])
     assert np.array([[a, b], [b, d]]) == pytest.approx(np.linalg.pinv(line), rel=1e-6)
+
+
+@given(st.lists(st.floats(0.01, 100.0), min_size=3, max_size=3),
+       st.lists(st.booleans(), min_size=3, max_size=3), st.integers(0, 1000))
+def test_only_positive_definite_matrices_are_solved(sizes, negative, seed):
+    values = np.where(negative, -1.0, 1.0) * sizes
+    axes = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
+    m = (axes * values) @ axes.T
+    m = 0.5 * (m + m.T)
+    g = axes[0] + 0.1
+    definite = not any(negative)
+    for matrix in (m, np.diag(values)):
+        assert (solved(matrix, g) is not None) == definite
+        assert (inverse_3x3(matrix) is not None) == definite
+        # LAPACK takes over.
+        assert matrix @ solution(matrix, g) == pytest.approx(g, rel=1e-6, abs=1e-9)
+        assert matrix @ inverse(matrix) == pytest.approx(np.eye(3), abs=1e-8)

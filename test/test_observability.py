@@ -248,3 +248,7 @@ def test_directions_in_words():
     assert weak.deviation == pytest.approx(10.0)
     assert unobserved_directions(information + 4.0 * np.outer(turning, turning), pose) == ()
     assert len(unobserved_directions(np.zeros((3, 3)), pose)) == 3
+    # Known in yaw alone, as by a compass; and in all but one.
+    assert len(unobserved_directions(np.diag([0.0, 0.5, 1e6]), pose)) == 2
+    assert len(unobserved_directions(np.diag([1e6, 0.5, 1e6]), pose)) == 1
+    assert len(unobserved_directions(np.diag([0.9, 0.9, 1e6]), pose, limit=1.1)) == 0

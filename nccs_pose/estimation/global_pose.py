@@ -37,7 +37,7 @@ from nccs_pose.estimation.observability import (
     unobserved_directions,
 )
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
-from nccs_pose.estimation.small_matrices import inverse_3x3, solved
+from nccs_pose.estimation.small_matrices import inverse, inverse_3x3, solved
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -240,5 +240,5 @@ def _solution(data: LabelledRays, found: _Found, lines: Symmetry) -> Solution:
         unobserved = max(unobserved, central, key=len)
     covariance = None
     if not unobserved:
-        covariance = np.asarray(np.linalg.inv(found.information), dtype=float)
+        covariance = inverse(found.information)
     return Solution(pose, found.chi2, found.information, covariance, unobserved, lines)

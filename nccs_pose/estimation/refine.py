@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.residual import check_rays_and_lines
 from nccs_pose.estimation.side_form import SideForm
-from nccs_pose.estimation.small_matrices import solved
+from nccs_pose.estimation.small_matrices import inverse, solution
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
@@ -84,8 +85,7 @@ class _Problem:
         return float(deviation @ slope), slope
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
+class _Point(NamedTuple):
     """Unknowns, with the residuals (N,) and their Jacobian (N, P) there."""
 
     unknowns: Array
@@ -156,7 +156,7 @@ def refine(
     # narrow it.
     inflation = float(e @ (e * trusted)) / max(1, count - 3)
     inflation = max(1.0, inflation) if noise_known else max(1e-6, inflation)
-    covariance = np.linalg.inv(normal / inflation + known)
+    covariance = inverse(normal / inflation + known)
     if calibration_sigma > 0.0:
         shift = form.image_shift(point.unknowns)
         answer = covariance @ (weighted @ shift) * (calibration_sigma / inflation)
@@ -215,7 +215,7 @@ def _descend(
         weighted = point.jacobian.T * weight
         normal = weighted @ point.jacobian + known
         damped = normal + damping * np.diag(np.diag(normal)) if damping else normal
-        step = _solution(damped, weighted @ e + pull_slope)
+        step = solution(damped, weighted @ e + pull_slope)
         unknowns = point.unknowns - step
         trial = _Point(unknowns, *problem.form.residual(unknowns))
         pull_there, slope_there = problem.pull(unknowns)
@@ -238,11 +238,3 @@ def _loss(e: Array, trusted: Array | float | None, width: float) -> float:
     if trusted is None:
         return width**2 * float(np.log1p(e * e / width**2).sum())
     return float(e @ (e * trusted))
-
-
-def _solution(matrix: Array, right: Array) -> Array:
-    """Solution (P,) of the normal equations."""
-    found = solved(matrix, right) if len(right) == 3 else None
-    if found is None:
-        found = np.asarray(np.linalg.solve(matrix, right), dtype=float)
-    return found

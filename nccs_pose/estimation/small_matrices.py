@@ -43,7 +43,7 @@ def solve_3x3(
 ) -> tuple[float, float, float] | None:
     """Solution of H v = g, with H positive definite beyond rounding; else None."""
     minor, trace = xx * yy - xy * xy, xx + yy
-    if not minor > ROUNDING * trace * trace:
+    if not (trace > 0.0 and minor > ROUNDING * trace * trace):
         return None
     ax, ay = (yy * xz - xy * yz) / minor, (xx * yz - xy * xz) / minor
     bx, by = (yy * gx - xy * gy) / minor, (xx * gy - xy * gx) / minor
@@ -61,12 +61,24 @@ def solved(matrix: Array, right: Array) -> Array | None:
     return None if found is None else np.array(found)
 
 
+def solution(matrix: Array, right: Array) -> Array:
+    """Solution (P,) of any regular, symmetric system (P, P)."""
+    found = solved(matrix, right) if len(right) == 3 else None
+    return np.asarray(np.linalg.solve(matrix, right), dtype=float) if found is None else found
+
+
 def inverse_3x3(matrix: Array) -> Array | None:
     """Inverse of a symmetric matrix (3, 3), positive definite beyond rounding; else None."""
     (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * p + b * q + c * r
-    if not determinant > ROUNDING * a * d * f:
-        return None
     s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * p + b * q + c * r
+    if not (a > 0.0 and u > 0.0 and determinant > ROUNDING * a * d * f):
+        return None
     return np.array([[p, q, r], [q, s, t], [r, t, u]]) / determinant
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse of any regular, symmetric matrix."""
+    found = inverse_3x3(matrix) if len(matrix) == 3 else None
+    return np.asarray(np.linalg.inv(matrix), dtype=float) if found is None else found
