@@ -25,11 +25,13 @@ from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, Monitor
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.pulls import pull_statistics
-from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.files.bags import BagReader, StampedImage
 from nccs_pose.geometry.pose import Pose2, rotation_exp
-from nccs_pose.simulation.scene import arena_map, arena_rig
+from nccs_pose.simulation.drive import make_drive, render_frame
+from nccs_pose.simulation.motion import figure_of_eight
+from nccs_pose.simulation.scene import arena_map, arena_rig, ideal_scene
 from nccs_pose.simulation.table_one import TABLE_ONE
 import numpy as np
 import pytest
@@ -135,6 +137,38 @@ def test_a_mirror_that_moved_is_told_with_the_size_of_the_move(name):
     assert max(abs(found - size) for (size, _), found in told.items()) < 0.03
     large = [found / size for (size, _), found in told.items() if size > 0.2]
     assert np.mean(large) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize('shift', [(0.11, 0.28), (-0.3, -0.05)])
+def test_images_that_are_hardly_followed_tell_the_size_of_the_move(shift):
+    scene = ideal_scene(640)
+    used = scene.rig
+    # An ordinary lens: an ideal one is sharper than the localiser thinks before it has tracked.
+    scene = replace(scene, rig=moved(used, shift), sensor=replace(scene.sensor, psf_sigma=0.65))
+    drive = make_drive(figure_of_eight(), 16, rate=16 / 30)
+    localiser, tracked = Localiser(used, LINES), 0
+    monitor = CalibrationMonitor(used, LINES, MonitorOptions(least_frames=10))
+    for frame in range(len(drive)):
+        sample = render_frame(scene, drive, frame)
+        estimate = localiser.process(sample.stamp_ns, sample.image)
+        tracked += estimate.state is State.TRACKING
+        monitor.add(estimate)
+    assert tracked < 8
+    assert told_shift(monitor.verdict()) == pytest.approx(np.hypot(*shift), rel=0.15)
+
+
+def test_a_doubted_pose_on_two_lines_is_not_believed():
+    """Half a turn about where two lines meet, they look the same."""
+    rig, monitors = RIGS['arena'], []
+    frame = predict_frame(rig, LINES, Pose2(0.3, 0.2, 0.5), sigma=0.2, points=20)
+    for lines, state in product((2, 3), (State.LOST, State.TRACKING)):
+        points = frame.points[frame.points.label < lines]
+        pose = Pose2(0.3, 0.2, 0.5)
+        estimate = (Estimate(0, state, 'whole lines lie 2 px off', doubted=Doubted(pose, points))
+                    if state is State.LOST else Estimate(0, state, '', pose, points=points))
+        monitors.append(CalibrationMonitor(rig, LINES))
+        monitors[-1].add(estimate)
+    assert [monitor.verdict().frames for monitor in monitors] == [0, 1, 1, 1]
 
 
 def test_a_camera_that_turned_is_told():

@@ -26,7 +26,7 @@ from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.calibration.procedure import calibrate, Calibration, converge
 from nccs_pose.errors import CalibrationError, FrameRefusedError
-from nccs_pose.estimation.estimate import State
+from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
@@ -62,10 +62,13 @@ class Measured:
 def measure(
     rig: Rig, line_map: LineMap, images: Iterable[tuple[int, Image]],
     options: LocaliserOptions | None = None,
+    look: Callable[[Estimate], None] = lambda estimate: None,
 ) -> Measured:
     """Run the localiser over images and keep what it measured on the lines.
 
     The localiser measures the middle of the tapes, with the curve's bias taken out.
+
+    :param look: shown every answer of the localiser, poses that it doubts included.
     """
     # The rig's height is what is to be found; no frame may have its own.
     options = options or LocaliserOptions(height_sigma=0.0)
@@ -81,6 +84,7 @@ def measure(
         except FrameRefusedError as error:
             reasons[error.cause] += 1
             continue
+        look(estimate)
         if estimate.state is not State.TRACKING or not estimate.pose or not estimate.points:
             reasons[estimate.reason] += 1
             continue

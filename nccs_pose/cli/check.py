@@ -27,7 +27,6 @@ from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
 _FEWEST = 10  # frames; fewer say nothing of a rig
@@ -51,22 +50,21 @@ def run(args: argparse.Namespace) -> int:
         least_frames=_FEWEST, memory=100000, pose_error=1e-3 * args.pose_error)
     images = DriveImages(args.bag, max(1, args.images), args.image_topic)
     images.check_size(rig.camera)
-    measured = measure(rig, line_map, images())
-    if not measured.frames:
+    monitor = CalibrationMonitor(rig, line_map, options)
+    # Under a rig that is off, poses are doubted, and tell most of all what is wrong.
+    measured = measure(rig, line_map, images(), look=monitor.add)
+    verdict = monitor.verdict()
+    if not measured.frames and verdict.condition is Condition.UNKNOWN:
         reason = measured.reasons.most_common(1)[0][0] if measured.reasons else 'no image'
         raise CalibrationError(
             f'in none of {measured.seen} images the lines could be followed ({reason}): wrong '
             'rig, wrong map, or wrong colour')
-    monitor = CalibrationMonitor(rig, line_map, options)
-    for frame, pose in zip(measured.frames, measured.poses):
-        monitor.add_frame(frame, Pose2.from_array(pose))
-    verdict = monitor.verdict()
-    model = RigModel(rig, line_map)
-    judged = judge(model, model, measured.frames, measured.poses)
     print(f'images followed: {len(measured.frames)} of {measured.seen}')
     for reason, count in measured.reasons.most_common(3):
         print(f'  {count} not: {reason}')
-    _print_structure(judged, line_map)
+    if measured.frames:
+        model = RigModel(rig, line_map)
+        _print_structure(judge(model, model, measured.frames, measured.poses), line_map)
     print(f'structure against noise: {verdict.statistic:.0f} (noise alone stays below '
           f'{verdict.limit:.0f})')
     print(verdict.words)
