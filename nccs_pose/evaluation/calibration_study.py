@@ -47,6 +47,7 @@ Random = np.random.Generator
 _X, _Y = 1.4, 0.9  # where the robot drives in the arena, metres either way: 0.4 m off the tapes
 _FRAMES = 20
 _DRIVE = 150  # images that calibrate looks at, of which it chooses
+_POINTS = 150  # of a line: 75 on each edge of the tape
 _COARSE = 33  # steps along a line by which its length in the image is measured
 
 
@@ -214,22 +215,24 @@ def cop_bound(
 
 def targets(
     kinds: Sequence[str], rigs: int, first: int = 0, mounting: bool = True, drive: int = _DRIVE,
+    points: int = _POINTS,
 ) -> None:
-    """20 frames x 4 lines x 75 px at 0.2 px, each number 0.3 mm or 0.3 degrees off at first.
+    """20 frames x 4 lines at 0.2 px, each number 0.3 mm or 0.3 degrees off at first.
 
     :param mounting: whether height and tilt are free as well as the camera against the mirror.
-    :param drive: images of which the 20 are chosen (and, beside them, every fifth held out).
+    :param drive: images of which the 20 are chosen, every fifth of them held out.
+    :param points: of each line.
     """
     line_map = arena_map()
     options = CalibrationOptions(height=mounting, tilt=mounting, max_frames=_FRAMES)
     for kind in kinds:
-        before, after, cop, seconds, total, freedom = [], [], [], [], 0.0, 0
-        bound = []
+        before, after, cop, bound, seconds = [], [], [], [], []
+        total, freedom = 0.0, 0
         for seed in range(first, first + rigs):
             rng = np.random.default_rng(seed)
             true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
             rough = off_in_each(true, rng)
-            frames, poses = measured_frames(true, line_map, drive, rng)
+            frames, poses = measured_frames(true, line_map, drive, rng, points=points)
             start = time.process_time()
             found = calibrate(rough, line_map, frames, options)
             seconds.append(time.process_time() - start)
@@ -245,10 +248,11 @@ def targets(
                 found.parameters.spread)
             total, freedom = total + one, freedom + k
         low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
-        far = np.array(before) > 100.0
+        far, small = np.array(before) > 100.0, np.array(after) < 0.5
         rms, least = (np.sqrt(np.mean(np.square(e), axis=0)) for e in (cop, bound))
         print(f'{kind}: {rigs} rigs; pose bias, median (worst) {np.median(before):.0f} '
-              f'({max(before):.0f}) -> {np.median(after):.3f} ({max(after):.3f}) mm; of the '
+              f'({max(before):.0f}) -> {np.median(after):.3f} ({max(after):.3f}) mm, below 0.5 mm '
+              f'{small.sum()} of {rigs}; of the '
               f'{far.sum()} that begin above 100 mm the worst ends at '
               f'{max(np.array(after)[far], default=0.0):.3f} mm; COP rms {rms[0]:.1f} and '
               f'{rms[1]:.1f} um, Cramer-Rao bound {least[0]:.1f} and {least[1]:.1f} um; chi2 per '
@@ -319,11 +323,13 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--kind', action='append', help='arena, or a rig of Table I; repeatable')
     parser.add_argument(
-        '--drive', type=int, default=_DRIVE, help='images that the frames are chosen of')
+        '--drive', type=int, default=_DRIVE, help='images to choose the frames of, of targets')
+    parser.add_argument(
+        '--points', type=int, default=_POINTS, help='of each line, of targets')
     arguments = parser.parse_args()
     if arguments.study == 'targets':
         targets(arguments.kind or ['arena', *TABLE_ONE], arguments.rigs,
-                arguments.first, not arguments.hold_mounting, arguments.drive)
+                arguments.first, not arguments.hold_mounting, arguments.drive, arguments.points)
     elif arguments.study == 'rough':
         rough_starts(arguments.kind or list(TABLE_ONE), arguments.rigs, arguments.first)
     else:
