@@ -81,8 +81,9 @@ _UNCERTAIN = 1e-11
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1
 _NEWTON_STEPS = 8
-# After a turn as small as this (rad) the next one, its square in size, is next to nothing.
-_LAST_TURN = 1e-5
+# After a turn as small as this (rad) the next one, of the size of its square, is next to nothing,
+# even where J has its valley next to a pole and the square counts a thousand times.
+_LAST_TURN = 1e-7
 
 
 def global_minimum(gram: Array, directions: Array) -> Minimum:

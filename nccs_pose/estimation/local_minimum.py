@@ -32,9 +32,9 @@ from nccs_pose.geometry.pose import Array, Pose2
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1
 _STEPS = 8
-# After a turn as small as this (rad) the next one, its square in size, is next to nothing; and at
-# a given yaw the cost is a square in x and y, which one step solves.
-_LAST_TURN = 1e-5
+# At a given yaw the cost is a square in x and y, which one step solves: what a step leaves to do is
+# of the size of its turn times itself (rad^2, rad m).
+_LEFT = 1e-10
 
 
 def minimum_near(gram: Array, directions: Array, pose: Pose2) -> Minimum:
@@ -72,7 +72,7 @@ def _newton(gram: Array, x: float, y: float, yaw: float) -> Minimum | None:
         x, y, yaw = x - dx, y - dy, yaw - turn
         if abs(yaw - start) > _ASTRAY:
             return None
-        if abs(turn) < _LAST_TURN:
+        if abs(turn) * (abs(turn) + abs(dx) + abs(dy)) < _LEFT:
             drop = gradient[0] * dx + gradient[1] * dy + gradient[2] * turn
             return Minimum(Pose2(x, y, yaw), cost - drop)
     return None
