@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.shift_solve import solve_shifts
@@ -74,6 +75,26 @@ def test_stations_move_as_the_exact_projection_of_their_points_does(unknown: int
     # Of the attitude only its small prior's worth is ever needed: the mirror is taken for a point.
     tolerance = 2e-3 if unknown < 3 else 0.05
     assert np.abs(numeric - slide[:, unknown]).max() < tolerance * np.abs(numeric).max()
+
+
+@pytest.mark.parametrize('degrees', [0.1, 0.3, 0.6])
+def test_stations_are_predicted_under_a_base_that_leans_and_has_risen(degrees: float) -> None:
+    predictor = BandPredictor(FloorTable(RIG, 5.0), MAP)
+    places = predictor.places(POSE, 16.0, 75)
+    roll, pitch, rise = math.radians(degrees), -0.7 * math.radians(degrees), 0.002
+    bands, _ = predictor.bands(places, POSE, np.array([rise, roll, pitch]))
+    leaning = dataclasses.replace(RIG, T_base_mirror=RigidTransform.from_rpy(
+        (roll, pitch, 0.0), (0.0, 0.0, rise)) @ RIG.T_base_mirror)
+    pixels, seen = leaning.project(POSE.inverse().apply(np.array([
+        MAP[k].start + d * MAP[k].direction
+        for k, d in zip(places.number.tolist(), places.distance.tolist())])))
+    level, _ = predictor.bands(places, POSE)
+    assert len(bands) == len(level) == seen.sum()
+    # Along the tape a station may stand where it likes.
+    off = np.abs(np.einsum('ni,ni->n', bands.midline - pixels, bands.across))
+    moved = np.abs(np.einsum('ni,ni->n', level.midline - pixels, level.across))
+    assert moved.max() > 3.0 * degrees
+    assert off.max() < 0.02
 
 
 def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> None:

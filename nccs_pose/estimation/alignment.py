@@ -239,11 +239,9 @@ class Aligner:
         :param attitude: the base's (z, roll, pitch) off its plane as known so far (3,): what is
             measured from there is small, and a profile is true to small shifts only.
         """
-        bands, slide = self._predictor.bands(places, start)
+        bands, slide = self._predictor.bands(places, start, attitude)
         if len(bands) < _LEAST_STATIONS:
             return None
-        known = slide[:, 3:] @ attitude
-        bands = bands.shifted(known)
         fit, colours = self._fit(image, bands, colours, rough)
         used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
         if used.sum() < _LEAST_STATIONS:
@@ -251,8 +249,8 @@ class Aligner:
         if not rough and bands.spacing[used].sum() < _LEAST_LENGTH:
             return None
         refinement = self._solved(
-            (known + fit.shift)[used], fit.sigma[used], slide[used], fit.group[used],
-            bands.across[used], start, prior)
+            (fit.shift + slide[:, 3:] @ attitude)[used], fit.sigma[used], slide[used],
+            fit.group[used], bands.across[used], start, prior)
         step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
                          float(wrap_angle(refinement.pose.yaw - start.yaw)),
                          *(refinement.attitude - attitude)])

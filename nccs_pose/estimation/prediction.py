@@ -37,6 +37,7 @@ _COARSE = 32
 _END = 3.0
 # So many stations at most, on all lines together.
 _MOST = 1500
+_LEVEL = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +108,13 @@ class BandPredictor:
         distance = np.interp(where + begin[number], axis, self._distance.ravel())
         return Places(number, distance, spacing_px)
 
-    def bands(self, places: Places, pose: Pose2) -> tuple[Bands, Array]:
+    def bands(
+        self, places: Places, pose: Pose2, attitude: Array = _LEVEL,
+    ) -> tuple[Bands, Array]:
         """How stations are seen from a pose.
 
         :param pose: T_map_base, not far from where the stations were chosen.
+        :param attitude: the base's (z, roll, pitch) off its plane (3,), metres and rad, small.
         :returns: those that are seen, and d(their place across)/d(x, y, yaw, z, roll, pitch)
             (N, 6), px per metre and rad; the last three as small motions of the base off its
             plane.
@@ -119,6 +123,10 @@ class BandPredictor:
         number, distance = places.number, places.distance
         direction = (self._direction @ rotation)[number]
         middle = ((self._start - position) @ rotation)[number] + distance[:, None] * direction
+        if attitude.any():
+            # Floor that sinks under a base that rises is seen where its rays met the plane.
+            middle = self._table.met(middle, attitude[1] * -middle[:, 1]
+                                     + attitude[2] * middle[:, 0] - attitude[0])
         image = self._table.expand(middle)
         # Vectors of the plane are complex numbers from here on: a quarter turn is a factor i,
         # and the product with a conjugate holds the dot product in its real part.

@@ -112,6 +112,7 @@ class FloorTable:
 
     :ivar rig: the rig that it was made for.
     :ivar reach: how far from the mirror's foot the table goes, metres.
+    :ivar foot: of the mirror on the floor (2,), in base_link.
     :ivar height: of the mirror over the floor, metres.
     :ivar region: (height, width) uint8, 255 where a pixel sees the floor within reach.
     :raises GeometryError: if the rig sees no floor.
@@ -120,7 +121,7 @@ class FloorTable:
     def __init__(self, rig: Rig, reach: float) -> None:
         self.rig = rig
         self.reach = reach
-        self._centre = rig.T_base_mirror.translation[:2]
+        self.foot = rig.T_base_mirror.translation[:2]
         self.height = float(rig.T_base_mirror.translation[2])
         if self.height <= 0.0:
             raise GeometryError(
@@ -142,8 +143,8 @@ class FloorTable:
         azimuth = (np.arange(-_PADDING, _AZIMUTHS + _PADDING) / _AZIMUTHS) * 2.0 * np.pi
         radius = self.height * np.tan(angle)
         points = np.zeros((len(angle), len(azimuth), 3))
-        points[..., 0] = self._centre[0] + radius[:, None] * np.cos(azimuth)
-        points[..., 1] = self._centre[1] + radius[:, None] * np.sin(azimuth)
+        points[..., 0] = self.foot[0] + radius[:, None] * np.cos(azimuth)
+        points[..., 1] = self.foot[1] + radius[:, None] * np.sin(azimuth)
         rig = self.rig
         # The rim is a matter of visibility, not of where a point would be seen.
         whole = replace(rig.mirror, rim_radius=None)
@@ -179,10 +180,12 @@ class FloorTable:
         :param seen: which are seen (angles, azimuths).
         """
         mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
-        offset = points[..., :2] - self._centre
+        offset = points[..., :2] - self.foot
         radius = np.linalg.norm(offset, axis=2)
         outward = np.einsum('rai,rai->ra', points[..., :2] - mirror[..., :2], offset)
         fall = np.maximum(mirror[..., 2], 1e-6) * np.maximum(radius, 1e-9)
+        self._fall = _filled(
+            (points[..., :2] - mirror[..., :2]) / np.maximum(mirror[..., 2:], 1e-6), seen)
         rows = [row for row in range(_PADDING + 1, len(points)) if seen[row].any()]
         return radius[rows, 0], np.array(
             [float(np.mean((outward[row] / fall[row])[seen[row]])) for row in rows])
@@ -196,22 +199,39 @@ class FloorTable:
         outward = np.interp(radius, *self._falls)
         return offset * (outward / np.maximum(radius, 1e-9))[:, None]
 
-    def pixels(self, points: Array) -> Array:
-        """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
-        offset = points - self._centre
-        radius = np.hypot(offset[:, 0], offset[:, 1])
-        angle = np.arctan2(radius, self.height)
+    def met(self, points: Array, rise: Array) -> Array:
+        """Where rays that see points over the floor meet it (N, 2), in base_link.
+
+        :param points: (N, 2), metres.
+        :param rise: how far they are over the floor, or under it (N,); small, metres.
+        """
+        met = points
+        # The rays a little further on are almost parallel: twice is enough.
+        for _ in range(2):
+            at = self._at(met - self.foot)
+            fall = np.stack([map_coordinates(component, at, order=1, mode='nearest')
+                             for component in self._fall], axis=1)
+            met = points + rise[:, None] * fall
+        return met
+
+    def _at(self, offset: Array) -> Array:
+        """Place in the grid (2, N) of floor points (N, 2) off the mirror's foot."""
+        angle = np.arctan2(np.hypot(offset[:, 0], offset[:, 1]), self.height)
         azimuth = np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi)
-        at = np.stack([
+        return np.stack([
             angle * (_ANGLES / self._last_angle) + _PADDING,
             azimuth * (_AZIMUTHS / (2.0 * np.pi)) + _PADDING])
+
+    def pixels(self, points: Array) -> Array:
+        """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
+        at = self._at(points - self.foot)
         return np.stack(
             [map_coordinates(spline, at, order=3, mode='nearest', prefilter=False)
              for spline in self._splines], axis=1)
 
     def expand(self, points: Array) -> FloorExpansion:
         """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
-        offset = points - self._centre
+        offset = points - self.foot
         square = np.einsum('ni,ni->n', offset, offset)
         radius = np.sqrt(square)
         # At the foot itself there is no direction outward; nothing is seen there but the robot.
@@ -248,7 +268,7 @@ class FloorTable:
         u, v = np.meshgrid(columns, rows)
         rays = self.rig.back_project(np.stack([u.ravel(), v.ravel()], axis=1).astype(float))
         points, reaches = rays.floor_points()
-        distance = np.linalg.norm(points - self._centre, axis=1)
+        distance = np.linalg.norm(points - self.foot, axis=1)
         reaches &= distance < self.reach
         points[~reaches] = 0.0
         shape = (len(rows), len(columns))
@@ -288,3 +308,11 @@ class FloorTable:
         start, rise = p00 + a * low, p01 - p00 + a * (high - low)
         by_u = (low + b * (high - low)) / _STRIDE
         return start + b * rise, np.stack([by_u, rise / _STRIDE], axis=2)
+
+
+def _filled(grid: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Both components of a grid (R, A, 2), unseen places taking over those of the row before."""
+    grid = grid.copy()
+    for row in range(1, len(grid)):
+        grid[row, ~seen[row]] = grid[row - 1, ~seen[row]]
+    return grid[..., 0], grid[..., 1]

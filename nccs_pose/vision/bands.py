@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from nccs_pose.geometry.pose import Array
 import numpy as np
@@ -53,8 +53,3 @@ class Bands:
         return Bands(
             self.centre[index], self.midline[index], self.across[index], self.along[index],
             self.bend[index], self.half_width[index], self.spacing[index], self.label[index])
-
-    def shifted(self, shift: Array) -> Bands:
-        """The same stations, each moved across by its own shift (N,), px."""
-        step = shift[:, None] * self.across
-        return replace(self, centre=self.centre + step, midline=self.midline + step)
