@@ -116,7 +116,8 @@ def best_pose(
     """The best pose and its covariance (3, 3), for lines that are known to fix one.
 
     The closed form, weighted by the variances at its pose and solved once more: the first of
-    :func:`solve`, without a look for others that are as good. Parameters are those of it.
+    :func:`solve`, whose parameters it has, but without a look for others that are as good, and
+    to the digits of the Gram matrix (within 0.02 standard deviations, of 1200 trials).
 
     :raises EstimationError: as :func:`solve` does, and where the rays leave a direction of the
         pose open.

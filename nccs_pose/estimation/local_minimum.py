@@ -32,8 +32,8 @@ from nccs_pose.geometry.pose import Array, Pose2
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1
 _STEPS = 8
-# At a given yaw the cost is a square in x and y, which one step solves: what a step leaves to do is
-# of the size of its turn times itself (rad^2, rad m).
+# At a given yaw the cost is a square in x and y, which one step solves: what a step leaves to do
+# is of the size of its turn times itself (rad^2, rad m).
 _LEFT = 1e-10
 
 
