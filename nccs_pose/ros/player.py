@@ -27,7 +27,7 @@ import time
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
-from nccs_pose.ros.start import initialise
+from nccs_pose.ros.start import initialise, interrupt_once, leave
 from nccs_pose.ros.transport import use_large_images
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -167,6 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     playback = Playback(
         options.rate, options.loop, options.start_offset, options.clock,
         tuple(options.topics or ()))
+    interrupt_once()
     use_large_images()
     try:
         initialise(arguments)
@@ -191,7 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if rclpy.ok():  # else: shut down while publishing
             raise
     finally:
-        rclpy.try_shutdown()
+        leave()
     return 0
 
 

@@ -27,7 +27,7 @@ import sys
 import traceback
 from typing import Any
 
-from nccs_pose.ros.start import initialise, StartError
+from nccs_pose.ros.start import initialise, leave, StartError, undisturbed
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -108,13 +108,11 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         if rclpy.ok():  # else: shut down while the node was made
             raise
     finally:
-        try:
-            if node is not None:
-                getattr(node, 'close', lambda: None)()
-                node.destroy_node()
-        except (KeyboardInterrupt, SystemExit):  # a second Ctrl-C while cleaning up
-            pass
-        rclpy.try_shutdown()
+        undisturbed()
+        if node is not None:
+            getattr(node, 'close', lambda: None)()
+            node.destroy_node()
+        leave()
     return 0
 
 

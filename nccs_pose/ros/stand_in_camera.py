@@ -39,7 +39,7 @@ from nccs_pose.ros.conversions import (
 )
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.resources import resolve
-from nccs_pose.ros.start import initialise
+from nccs_pose.ros.start import initialise, interrupt_once, leave
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import (
     ImageSample,
@@ -161,6 +161,7 @@ class StandInCamera(Node):
 
 def main() -> int:
     """Entry point of `ros2 run nccs_pose stand_in_camera`."""
+    interrupt_once()
     use_large_images()
     try:
         initialise()
@@ -175,7 +176,7 @@ def main() -> int:
         if rclpy.ok():  # else: shut down in the middle of publishing
             raise
     finally:
-        rclpy.try_shutdown()
+        leave()
     return 0
 
 

@@ -12,14 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Initialising ROS, with words instead of a traceback where it cannot be."""
+"""Initialising ROS, with words instead of a traceback where it cannot be; and leaving it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 import os
 from pathlib import Path
+import signal
 import tempfile
+from typing import NoReturn
 
 from nccs_pose.errors import NccsPoseError
 import rclpy
@@ -46,3 +48,30 @@ def initialise(args: Sequence[str] | None = None) -> None:
         rclpy.init(args=None if args is None else list(args))
     except RuntimeError as error:  # base of every RCLError
         raise StartError(f'cannot start: {" ".join(str(error).split())}') from error
+
+
+def interrupt_once() -> None:
+    """Let the first Ctrl-C raise KeyboardInterrupt, and none after it disturb the leaving.
+
+    A program in a launch file gets one from the terminal and one from launch.
+    """
+    def interrupt(number: int, frame: object) -> NoReturn:
+        undisturbed()
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, interrupt)
+
+
+def undisturbed() -> None:
+    """Let SIGINT and SIGTERM do nothing from here on: what they ask for is being done."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+
+
+def leave() -> None:
+    """Shut rclpy down, undisturbed to the end of Python, which would bring back the defaults."""
+    undisturbed()
+    rclpy.try_shutdown()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)

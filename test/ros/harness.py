@@ -32,6 +32,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # So begins a shell's background job, and so would the programs that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 PATIENCE = 30.0
 """Seconds until a test gives up waiting; a loaded machine is no failure."""
@@ -59,10 +63,12 @@ class Process:
         """Whether it still runs."""
         return self._popen.poll() is None
 
-    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
-        """Send a signal if it runs, and return the exit code."""
-        if self.running():
-            self._popen.send_signal(how)
+    def stop(self, how: signal.Signals = signal.SIGINT, times: int = 1) -> int:
+        """Send a signal, as often as told while it runs, and return the exit code."""
+        for _ in range(times):
+            if self.running():
+                self._popen.send_signal(how)
+                time.sleep(0.01 if times > 1 else 0.0)
         return self.wait()
 
     def wait(self) -> int:
