@@ -139,6 +139,8 @@ class Localiser:
         self._prior: tuple[Pose2, Array] | None = None
         self._ever_tracked = False
         self._frames_since_check = 0
+        # Images in a row that were searched and showed no pose.
+        self._in_vain = 0
         self._colours = self._fresh_colours()
         # Poses among which no image has decided yet, and where the wheels were then.
         self._open: tuple[Hypothesis, ...] = ()
@@ -244,13 +246,17 @@ class Localiser:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         now = self._odometry.at(stamp_ns)
         hypotheses = carried(self._open, self._open_odometry, now)
-        for sight in sights(image, self._searcher, self._fresh_colours(), watch.lap):
+        refusals: list[Refused] = []
+        for sight in sights(
+                image, self._searcher, self._fresh_colours(), self._in_vain, watch.lap):
             segments = sight.segments
             sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction)
             watch.lap('measure')
+            refusals += sifted.refused
             if sifted.held:
                 break
         held = sifted.held
+        self._in_vain = 0 if held else self._in_vain + 1
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
             here = self._judge.measured(refused.alignment, segments).score
@@ -261,8 +267,8 @@ class Localiser:
             if trusted is not None:
                 return self._tracking(
                     stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
-            if refused.objection is None and sifted.refused:
-                refused = sifted.refused[0]
+            if refused.objection is None and refusals:
+                refused = refusals[0]
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
         chosen = self._decide(held, prediction)
         if chosen is not None:

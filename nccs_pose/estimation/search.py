@@ -46,9 +46,9 @@ Look = Callable[[NDArray[np.uint8], Strips, Colours], tuple[Strips, Colours]]
 class Searcher:
     """Finds line-like strips in images and the poses that explain them, for one rig and map.
 
-    :ivar looks: ways to find the strips of an image, the one that suffices for most images first.
-        Each takes the strips found before and what the tapes were thought to look like, and gives
-        its own of both.
+    :ivar first: the way to find the strips of an image that suffices for most.
+    :ivar further: ways for the others, in groups that belong together. Each look takes the strips
+        found before and what the tapes were thought to look like, and gives its own of both.
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
@@ -64,28 +64,42 @@ class Searcher:
             pitch *= 2
         self._view = ReducedView.of(table.region, pitch)
         self._closer = ReducedView.of(table.region, max(pitch // 2, 1))
-        self.looks: tuple[Look, ...] = (
-            lambda image, _, colours: (self.segments(image), colours),
-            self._look_by_example,
-            # A tape no brighter than the pattern of its floor shows in a sharp image only.
-            lambda image, _, colours: (self._look(image, self._closer), colours))
-        if by_hsv:
-            self.looks = self.looks[:1]
+        self.first: Look = self._first_look
+        self.further: tuple[tuple[Look, ...], ...] = () if by_hsv else (
+            (self._look_by_example,), (self._closer_look, self._look_by_example))
 
     def segments(self, image: NDArray[np.uint8]) -> Strips:
         """Straight strips of the map's colours on the floor, the largest first."""
         return self._look(image, self._view)
 
-    def _look(self, image: NDArray[np.uint8], view: ReducedView) -> Strips:
-        part = view.read(image)
-        return self._strips({c: self._mask(part, c, view) for c in self._widths}, view)
+    def _first_look(
+        self, image: NDArray[np.uint8], _: Strips, colours: Colours,
+    ) -> tuple[Strips, Colours]:
+        return self.segments(image), colours
 
-    def _mask(self, part: NDArray[np.uint8], colour: str, view: ReducedView) -> Mask:
+    def _closer_look(
+        self, image: NDArray[np.uint8], _: Strips, colours: Colours,
+    ) -> tuple[Strips, Colours]:
+        # A tape hardly brighter than the pattern of its floor shows in a sharp image, and only
+        # where what is brighter to one side does not count.
+        return self._look(image, self._closer, ridges=True), colours
+
+    def _look(
+        self, image: NDArray[np.uint8], view: ReducedView, *, ridges: bool = False,
+    ) -> Strips:
+        part = view.read(image)
+        masks = {c: self._mask(part, c, view, ridges=ridges) for c in self._widths}
+        return self._strips(masks, view)
+
+    def _mask(
+        self, part: NDArray[np.uint8], colour: str, view: ReducedView, *, ridges: bool = False,
+    ) -> Mask:
         options = self._options
         if options.threshold == 'hsv':
             return hsv_mask(part, colour)
         return chromatic_mask(
-            part, colour, options.noise_gate, options.least_contrast, self._window(view))
+            part, colour, options.noise_gate, options.least_contrast, self._window(view),
+            ridges=ridges)
 
     def _look_by_example(
         self, image: NDArray[np.uint8], known: Strips, colours: Colours,

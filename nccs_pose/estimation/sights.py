@@ -61,18 +61,23 @@ class Sight:
 
 
 def sights(
-    image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...],
+    image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
     lap: Callable[[str], None],
 ) -> Iterator[Sight]:
     """What is worth a try: every look that is promising, and at last the best if none was.
 
     What is given is to be tried before the next is asked for.
 
+    :param in_vain: how many images before this one were searched and showed nothing; then the
+        further looks take turns from image to image.
     :param lap: is told the name of each stage that ends.
     """
+    groups = searcher.further
+    if in_vain and groups:
+        groups = groups[in_vain % len(groups):][:1]
     best: Sight | None = None
     tried: list[Sight] = []
-    for look in searcher.looks:
+    for look in (searcher.first, *(look for group in groups for look in group)):
         segments, shown = look(image, best.segments if best is not None else (), colours)
         if best is not None and segments is best.segments:
             continue

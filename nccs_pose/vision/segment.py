@@ -64,7 +64,8 @@ class Segmentation:
 
 
 def chromatic_mask(
-    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int,
+    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int, *,
+    ridges: bool = False,
 ) -> Mask:
     """Where the image has more of a colour than its surroundings.
 
@@ -75,8 +76,10 @@ def chromatic_mask(
     :param gate: threshold in standard deviations of the image's noise.
     :param least: smallest contrast that counts, as a fraction of the image's brightness.
     :param window: width of the surroundings, px.
+    :param ridges: take only what stands out to both sides: the rims of large things do not.
     """
-    return raised_mask(_contrast(image, colour), brightness(image), gate, least, window)
+    return raised_mask(
+        _contrast(image, colour), brightness(image), gate, least, window, ridges=ridges)
 
 
 def brightness(image: NDArray[np.uint8]) -> float:
@@ -84,17 +87,24 @@ def brightness(image: NDArray[np.uint8]) -> float:
     return float(np.median(image[::8, ::8, 1]))
 
 
-def raised_mask(feature: Mask, bright: float, gate: float, least: float, window: int) -> Mask:
+def raised_mask(
+    feature: Mask, bright: float, gate: float, least: float, window: int, *, ridges: bool = False,
+) -> Mask:
     """Where a feature stands out of its surroundings; see :func:`chromatic_mask`.
 
     :param feature: (H, W) uint8, high on tapes.
     :param bright: brightness of the image, grey levels.
     """
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
-    around = cv2.blur(feature, (window, window))
+    if ridges:
+        around = cv2.morphologyEx(feature, cv2.MORPH_OPEN, np.ones((window, window), np.uint8))
+    else:
+        around = cv2.blur(feature, (window, window))
     sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
-    noise = 1.4826 * float(np.median(np.abs(sparse)))
-    threshold = max(2.0, gate * noise, least * bright)
+    # What is left of noise by an opening is above it.
+    usual = float(np.median(sparse)) if ridges else 0.0
+    noise = 1.4826 * float(np.median(np.abs(sparse - usual)))
+    threshold = usual + max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
