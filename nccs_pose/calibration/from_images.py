@@ -30,7 +30,7 @@ from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +40,18 @@ Images = Callable[[], Iterable[tuple[int, Image]]]
 
 _PASSES = 4
 _LEAST_LINES = 2
-_SETTLED = 0.3  # fraction of a standard deviation
+_LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
+# A rough rig fits a single image better if that image may have a height and a tilt of its own.
+_ROUGHLY = LocaliserOptions(height_sigma=0.01, tilt_sigma=0.005)
+# In the end height and tilt are what is to be found; no frame may have its own.
+_STRICTLY = LocaliserOptions(height_sigma=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
     """What the localiser made of a drive under one rig.
 
-    :ivar frames: those that it tracked.
+    :ivar frames: those that it tracked, or could lay a pose on at all.
     :ivar poses: theirs, T_map_base (F, 3).
     :ivar seen: how many images there were.
     :ivar reasons: why the others gave nothing, with counts.
@@ -61,17 +65,16 @@ class Measured:
 
 def measure(
     rig: Rig, line_map: LineMap, images: Iterable[tuple[int, Image]],
-    options: LocaliserOptions | None = None,
+    options: LocaliserOptions = _STRICTLY, *, doubted: bool = False,
     look: Callable[[Estimate], None] = lambda estimate: None,
 ) -> Measured:
     """Run the localiser over images and keep what it measured on the lines.
 
     The localiser measures the middle of the tapes, with the curve's bias taken out.
 
+    :param doubted: keep poses that it doubts as well, if they rest on three lines.
     :param look: shown every answer of the localiser, poses that it doubts included.
     """
-    # The rig's height is what is to be found; no frame may have its own.
-    options = options or LocaliserOptions(height_sigma=0.0)
     localiser = Localiser(rig, line_map, options)
     frames: list[FrameObservation] = []
     poses: list[Array] = []
@@ -85,13 +88,27 @@ def measure(
             reasons[error.cause] += 1
             continue
         look(estimate)
-        if estimate.state is not State.TRACKING or not estimate.pose or not estimate.points:
+        found = _found(estimate, doubted)
+        if found is None:
             reasons[estimate.reason] += 1
             continue
-        points = estimate.points[estimate.points.label >= 0]
-        frames.append(FrameObservation(stamp_ns, points, np.zeros(len(points), dtype=np.int8)))
-        poses.append(estimate.pose.as_array())
+        frames.append(found[0])
+        poses.append(found[1].as_array())
     return Measured(frames, np.array(poses).reshape(-1, 3), seen, reasons)
+
+
+def _found(estimate: Estimate, doubted: bool) -> tuple[FrameObservation, Pose2] | None:
+    """What an answer says of the lines, and the pose that it believes, or doubts."""
+    pose, points, least = estimate.pose, estimate.points, 1
+    if estimate.state is not State.TRACKING:
+        if not doubted or estimate.doubted is None:
+            return None
+        pose, points, least = estimate.doubted.pose, estimate.doubted.points, _LEAST_DOUBTED
+    if pose is None or points is None:
+        return None
+    points = points[points.label >= 0]
+    frame = FrameObservation(estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8))
+    return (frame, pose) if len(frame.lines) >= least else None
 
 
 def calibrate_images(
@@ -100,9 +117,9 @@ def calibrate_images(
 ) -> Calibration:
     """Refine a rough rig from the images of a drive.
 
-    Under the rough rig the localiser follows some frames, and from these a better rig is
-    estimated, under which it follows more; a rig too rough to follow any frame is refined from
-    the blobs of the lines' colour first.
+    Under the rough rig the localiser follows some frames, or lays poses on them that it doubts,
+    and from these a better rig is estimated, under which it follows more; a rig too rough even for
+    that is refined from the blobs of the lines' colour first.
 
     :param images: gives (stamp in ns, BGR image) anew at each call.
     :param on_pass: told in words how far it is.
@@ -111,12 +128,13 @@ def calibrate_images(
     options = options or CalibrationOptions()
     parameters = RigParameters(rig, line_map, options, free_lines)
     better, before = rig, 0
-    measured = measure(rig, line_map, images())
-    on_pass(f'{len(measured.frames)} of {measured.seen} images followed under the rough rig')
+    measured = _measure_roughly(rig, line_map, images)
+    on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly under the rough '
+            'rig')
     if _usable(measured) < options.min_frames:
         better = _from_blobs(parameters, images, measured, options)
-        measured = measure(better, line_map, images())
-        on_pass(f'{len(measured.frames)} of {measured.seen} images followed after a first '
+        measured = _measure_roughly(better, line_map, images)
+        on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly after a first '
                 'guess from the blobs of the lines')
     if not measured.frames:
         raise CalibrationError(_nothing(measured))
@@ -125,6 +143,8 @@ def calibrate_images(
         better = parameters.model(theta, with_rim=True).rig
         measured = measure(better, line_map, images())
         on_pass(f'{len(measured.frames)} of {measured.seen} images followed under a refined rig')
+        if _usable(measured) < options.min_frames:
+            measured = _measure_roughly(better, line_map, images)
         if len(measured.frames) <= before:
             break
         before = len(measured.frames)
@@ -133,7 +153,13 @@ def calibrate_images(
     result = calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
     # The noise was measured with what the last rig left in the residuals; now it is clean.
     measured = measure(result.model.rig, result.model.line_map, images())
+    if _usable(measured) == 0:
+        raise CalibrationError(_nothing(measured))
     return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+
+
+def _measure_roughly(rig: Rig, line_map: LineMap, images: Images) -> Measured:
+    return measure(rig, line_map, images(), _ROUGHLY, doubted=True)
 
 
 def _usable(measured: Measured) -> int:
