@@ -53,6 +53,7 @@ class TransformOutput:
 
         :param refuse: called with cause and words when a transform could not be made.
         """
+        self._node = node
         self._options = options
         self._refuse = refuse
         self._pending: deque[tuple[int, Pose2]] = deque(maxlen=MOST_WAITING)
@@ -119,9 +120,12 @@ class TransformOutput:
             self._send(stamp_ns, self._options.odom, pose @ odom_base.inverse())
 
     def close(self) -> None:
-        """Stop listening."""
+        """Take back what tf2_ros has made on the node, which may be configured again."""
         if self._listener is not None:
             self._listener.unregister()
+            self._node.destroy_service(self._buffer.srv)
+        if self._broadcaster is not None:
+            self._node.destroy_publisher(self._broadcaster.pub_tf)
 
     def _send(self, stamp_ns: int, child: str, pose: Pose2) -> None:
         message = TransformStamped()

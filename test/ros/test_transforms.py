@@ -65,14 +65,17 @@ class Tf2:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.known: dict[tuple[str, str, int], TransformStamped] = {}
         self.sent: list[TransformStamped] = []
+        self.gone: list[str] = []
         self.arrived = Waiting()
         module = types.ModuleType('tf2_ros')
         module.TransformException = TransformError
-        module.Buffer = lambda node: types.SimpleNamespace(lookup_transform=self.lookup)
+        module.Buffer = lambda node: types.SimpleNamespace(
+            lookup_transform=self.lookup, srv='service tf2_frames')
         module.TransformListener = lambda buffer, node: types.SimpleNamespace(
-            unregister=lambda: None, tf_sub=self.arrived, callback=lambda item: self.add(*item))
+            unregister=lambda: self.gone.append('listener'), tf_sub=self.arrived,
+            callback=lambda item: self.add(*item))
         module.TransformBroadcaster = lambda node: types.SimpleNamespace(
-            sendTransform=self.sent.append)
+            sendTransform=self.sent.append, pub_tf='publisher of /tf')
         monkeypatch.setitem(sys.modules, 'tf2_ros', module)
 
     def lookup(self, target: str, source: str, time: Time) -> TransformStamped:
@@ -194,3 +197,13 @@ def test_none_sends_nothing_and_needs_no_tf2(monkeypatch: pytest.MonkeyPatch):
     out.broadcast(STAMP, Pose2())
     with pytest.raises(OptionError, match='apt install ros-jazzy-tf2-ros-py'):
         output(tf_mode='map_to_odom')
+
+
+@pytest.mark.parametrize(('mode', 'made'), [
+    ('none', []), ('map_to_base', ['publisher of /tf']),
+    ('map_to_odom', ['listener', 'service tf2_frames', 'publisher of /tf'])])
+def test_what_tf2_made_on_the_node_is_taken_back(tf2: Tf2, mode: str, made: list[str]):
+    node = types.SimpleNamespace(
+        destroy_service=tf2.gone.append, destroy_publisher=tf2.gone.append)
+    TransformOutput(node, NodeOptions(tf_mode=mode), lambda *_: None).close()
+    assert tf2.gone == made
