@@ -53,3 +53,12 @@ class Bands:
         return Bands(
             self.centre[index], self.midline[index], self.across[index], self.along[index],
             self.bend[index], self.half_width[index], self.spacing[index], self.label[index])
+
+
+def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The first member and the length of every run of equal numbers (R,), among N > 0."""
+    edge = np.empty(len(number) + 1, dtype=bool)
+    edge[0] = edge[-1] = True
+    np.not_equal(number[1:], number[:-1], out=edge[1:-1])
+    at = np.flatnonzero(edge)
+    return at[:-1], at[1:] - at[:-1]

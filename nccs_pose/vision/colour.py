@@ -44,6 +44,8 @@ _EVIDENT = 4.0
 # Blur that an image can have, px, and how far one image may change it.
 _BLUR_RANGE = (0.25, 3.0)
 _BLUR_STEP = 0.5
+# One grey level of rounding keeps a noise-free image from a singular covariance.
+_ROUNDING = 0.1 * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +101,15 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter @ scatter)) / total:
             return self
-        good = along > 0.3 * max(float(np.median(along)), 0.0)
-        if good.sum() < 10:
+        middle = len(along) // 2
+        good = along > 0.3 * max(float(np.partition(along, middle)[middle]), 0.0)
+        count = np.count_nonzero(good)
+        if count < 10:
             return self
         weight = power * good
-        contrast = weight @ height / weight.sum()
-        return self.taught(contrast, clutter[good].mean(axis=0), floor)
+        return self.taught(
+            weight @ height / weight.sum(),
+            (good @ clutter.reshape(-1, 9)).reshape(3, 3) / count, floor)
 
     def taught(self, contrast: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over a contrast (3,) to a floor's colour (3,), unless it is not of this class.
@@ -113,8 +118,7 @@ class LineColour:
         """
         if self._unlike(contrast, floor) or float(contrast @ contrast) < _LEAST_CONTRAST**2:
             return self
-        # One grey level of rounding keeps a noise-free image from a singular covariance.
-        return replace(self, contrast=contrast, clutter=clutter + 0.1 * np.eye(3))
+        return replace(self, contrast=contrast, clutter=clutter + _ROUNDING)
 
     def _unlike(self, contrast: Array, floor: Array) -> bool:
         """Whether a contrast (3,) to a floor's colour (3,) is another class's.
@@ -125,8 +129,8 @@ class LineColour:
         relative = contrast / np.maximum(floor, 1.0)
         nominal = np.array(CONTRASTS[self.name])
         if self._coloured:
-            relative = relative - relative.mean()
-        size = float(np.linalg.norm(relative) * np.linalg.norm(nominal))
+            relative = relative - relative.sum() / 3.0
+        size = math.sqrt(float(relative @ relative) * float(nominal @ nominal))
         return float(relative @ nominal) < _DRIFT_COSINE * size or size == 0.0
 
     @property
@@ -148,5 +152,6 @@ class LineColour:
         total = float((height * height) @ power)
         if total < 1e-9:
             return self
-        step = float(np.clip((height @ left) / total, -_BLUR_STEP, _BLUR_STEP))
-        return replace(self, blur=float(np.clip(self.blur + step, *_BLUR_RANGE)))
+        step = min(max(float(height @ left) / total, -_BLUR_STEP), _BLUR_STEP)
+        least, most = _BLUR_RANGE
+        return replace(self, blur=min(max(self.blur + step, least), most))

@@ -27,12 +27,14 @@ pixels would blur them and correlate their noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 import math
+from typing import NamedTuple
 
 import cv2
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -100,11 +102,10 @@ def _read_pixels(
     bend = (0.5 * bands.bend).astype(np.float32)[:, None]
     half_band = (bands.half_width + margin).astype(np.float32)
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    t = bands.spacing.astype(np.float32)[:, None] * (
-        (np.arange(rows, dtype=np.float32) + 0.5) / rows - 0.5)
+    t = bands.spacing.astype(np.float32)[:, None] * _middles(rows)
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
     on_curve = (bend * t * t - 1j * t) * across
-    arm = (half_band[:, None] * np.linspace(-1.0, 1.0, k, dtype=np.float32)) * across
+    arm = (half_band[:, None] * _between(k)) * across
     at = (on_curve + centre[:, None])[:, :, None] + arm[:, None, :]
     pixels = at.view(np.float32)
     np.rint(pixels, out=pixels)
@@ -117,6 +118,18 @@ def _read_pixels(
     s = np.square(at.imag)
     s *= bend
     return values, np.subtract(at.real, s, out=s)
+
+
+@cache
+def _middles(count: int) -> NDArray[np.float32]:
+    """The middles of so many equal parts of what reaches from -1/2 to 1/2."""
+    return (np.arange(count, dtype=np.float32) + 0.5) / count - 0.5
+
+
+@cache
+def _between(count: int) -> NDArray[np.float32]:
+    """So many places from -1 to 1."""
+    return np.linspace(-1.0, 1.0, count, dtype=np.float32)
 
 
 def as_complex(points: Array) -> NDArray[np.complex64]:
@@ -138,7 +151,7 @@ def _products(
         and the floor's colour (3,), which the channels are less.
     """
     n, count = s.shape
-    floor = pixels[:, 0].mean(axis=0)
+    floor = np.array(cv2.mean(pixels[:, :1])[:3])
     wide = np.float32(1.0 / blur) * half_width.astype(np.float32)[:, None]
     edges = np.empty((2, n, count), np.float32)
     scaled = s * np.float32(1.0 / blur)
@@ -163,15 +176,13 @@ def _products(
         np.subtract(channel, np.float32(floor[k]), out=rows[:, 4 + k])
     rows[:, 7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
-    products = (rows[:, :7] @ rows.transpose(0, 2, 1)).astype(float)
+    products = rows[:, :7] @ rows.transpose(0, 2, 1)
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    products *= scale[:7, None] * scale
-    return products, floor
+    return products * (scale[:7, None] * scale), floor
 
 
-@dataclass(frozen=True, eq=False)
-class _Groups:
+class _Groups(NamedTuple):
     """Neighbours on a line that share what is no shift.
 
     :ivar first: member of each group (G,).
@@ -186,16 +197,13 @@ class _Groups:
     @classmethod
     def of(cls, bands: Bands) -> _Groups:
         """Parts of equal length of each line; the label ascends."""
-        n = len(bands)
-        begin = np.concatenate([[0], np.flatnonzero(bands.label[1:] != bands.label[:-1]) + 1])
-        count = np.diff([*begin, n])
+        begin, count = runs(bands.label)
         # All stations of a line stand for pieces of the same length.
-        parts = np.clip(count * bands.spacing[begin] // _SHARED_PX, 1.0, count)
-        place = (np.arange(n) - np.repeat(begin, count)) * np.repeat(parts / count, count)
-        number = (place + np.repeat(np.cumsum(parts) - parts, count) + 1e-9).astype(np.intp)
-        first = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
-        members = np.diff([*first, n])
-        return cls(first, members, number)
+        parts = np.minimum(np.maximum(count * bands.spacing[begin] // _SHARED_PX, 1.0), count)
+        share = parts / count
+        number = (np.arange(len(bands)) * share.repeat(count) + (
+            np.cumsum(parts) - parts - begin * share + 1e-9).repeat(count)).astype(np.intp)
+        return cls(*runs(number), number)
 
 
 def fit_profiles(
@@ -229,19 +237,20 @@ def fit_profiles(
     fit, shared = _shifts(
         products, means, system, colour.discriminant, groups, size, bands, repeats)
     # A template beside its tape would take the misfit for blur.
-    if not rough and float(np.median(np.abs(shared))) < _SHARP_PX:
+    if not rough and median(np.abs(shared)) < _SHARP_PX:
         share = centred[:, 3, 0] / system.power
+        weights = colour.discriminant
         colour = colour.sharpen(
-            system.height @ colour.discriminant,
-            (centred[:, 3, 4:] - share[:, None] * centred[:, 0, 4:]) @ colour.discriminant,
+            system.height @ weights,
+            centred[:, 3, 4:] @ weights - share * (centred[:, 0, 4:] @ weights),
             centred[:, 3, 3] - share * centred[:, 3, 0])
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
-    return replace(fit, shift=gain * fit.shift, sigma=gain * fit.sigma), colour
+    return ProfileFit(
+        gain * fit.shift, gain * fit.sigma, fit.contrast, fit.found, fit.group), colour
 
 
-@dataclass(frozen=True, eq=False)
-class _System:
+class _System(NamedTuple):
     """The normal equations of G groups after elimination: contrast, floor's slope, shift.
 
     :ivar power: of T (G,).
@@ -299,12 +308,12 @@ def _shifts(
     """
     power, slope = system.power, system.slope @ weights
     variance = np.maximum((system.left @ weights) @ weights / (size - 4), 1e-12)
-    usual = float(np.partition(variance, len(variance) // 2)[len(variance) // 2])
+    usual = median(variance)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
     # A slope of the floor costs a wide tape much of what it tells. How far the slopes of all
     # groups exceed their noise says how much of each is to be believed.
-    excess = float(np.mean(slope * slope / (system.slope_power * variance))) - 1.0
+    excess = float((slope / (system.slope_power * variance)) @ slope) / len(slope) - 1.0
     belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
     share = belief * system.crossed / system.slope_power
     shift_power = np.maximum(system.own_power - share * system.crossed, 1e-9)
@@ -334,6 +343,12 @@ def _shifts(
         own / own_power / smooth[of], sigma, (a / level)[of], found[of], of), moved / smooth
 
 
+def median(values: Array) -> float:
+    """The middle one of some values (N,), the upper one of two."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
 def _levels(
     label: NDArray[np.intp], a: Array, weight: Array, told: Array, width: Array,
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -342,16 +357,12 @@ def _levels(
     :param label: line (N,), ascending.
     :param width: of the tape (N,), px.
     """
+    first, count = runs(label)
     order = np.lexsort((a, label))
-    edge = np.flatnonzero(np.diff(label)) + 1
-    number = np.zeros(len(label), dtype=np.intp)
-    number[edge] = 1
-    number = np.cumsum(number)
     total = np.cumsum(weight[order])
-    bounds = np.concatenate([[0.0], total[edge - 1], total[-1:]])
-    middle = np.searchsorted(total, 0.5 * (bounds[1:] + bounds[:-1]))
-    level = a[order[np.minimum(middle, len(order) - 1)]]
+    half = total[first + count - 1] - 0.5 * np.add.reduceat(weight, first)
+    level = a[order[np.searchsorted(total, half)]]
     # Far stations are faint one by one, but a whole line of them is not.
-    certain = (level * np.sqrt(np.bincount(number, told)) > FOUND) & (
-        level > _FAINT * np.minimum(1.0, np.bincount(number, width) / np.bincount(number)))
-    return np.where(certain, level, 1e-9)[number], certain[number]
+    certain = (level * np.sqrt(np.add.reduceat(told, first)) > FOUND) & (
+        level > _FAINT * np.minimum(1.0, np.add.reduceat(width, first) / count))
+    return np.where(certain, level, 1e-9).repeat(count), certain.repeat(count)
