@@ -18,15 +18,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from nccs_pose.estimation.common_errors import common_errors
+from nccs_pose.estimation.common_errors import common_errors, root_mean_square
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.shift_solve import pooled, solve_shifts
+from nccs_pose.estimation.small_matrices import solution
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
-from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
 from nccs_pose.vision.profile_search import search_profiles
@@ -244,13 +245,15 @@ class Aligner:
             return None
         fit, colours = self._fit(image, bands, colours, rough)
         used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
-        if used.sum() < _LEAST_STATIONS:
+        at = np.flatnonzero(used)
+        if len(at) < _LEAST_STATIONS:
             return None
-        if not rough and bands.spacing[used].sum() < _LEAST_LENGTH:
+        if not rough and float(bands.spacing @ used) < _LEAST_LENGTH:
             return None
         refinement = self._solved(
-            (fit.shift + slide[:, 3:] @ attitude)[used], fit.sigma[used], slide[used],
-            fit.group[used], bands.across[used], start, prior)
+            (fit.shift + slide[:, 3:] @ attitude).take(at), fit.sigma.take(at),
+            slide.take(at, axis=0), fit.group.take(at), bands.across.take(at, axis=0), start,
+            prior)
         step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
                          float(wrap_angle(refinement.pose.yaw - start.yaw)),
                          *(refinement.attitude - attitude)])
@@ -262,35 +265,30 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     """What a last pass over a map of so many lines comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
     index = np.flatnonzero(measured.used)[refinement.inlier]
+    group = fit.group.take(index)
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.
     worth = bands.spacing * np.minimum(1.0, bands.half_width)
     residual = refinement.residual[refinement.inlier]
-    sigma, label = fit.sigma[index], bands.label[index]
-    scale = float(np.sqrt(np.mean(residual**2)))
-    pixels = bands.midline[index] + fit.shift[index, None] * bands.across[index]
-    first = np.flatnonzero(np.diff(fit.group[index], prepend=-1))
+    sigma, label = fit.sigma.take(index), bands.label.take(index)
+    scale = root_mean_square(residual)
+    pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
+    first, _ = runs(group)
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
     correlation, misfit = common_errors(
-        pooled(residual, fit.group[index]), together, label[first])
+        pooled(residual, group), together, label[first])
+    seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, correlation * refinement.covariance, refinement,
-        LinePoints(pixels, scale * sigma, label), float(worth[index].sum() / worth.sum()),
-        tuple(np.unique(label).tolist()), _missing(bands, index),
-        _support(bands, index, lines), misfit, measured.colours)
-
-
-def _support(bands: Bands, found: NDArray[np.intp], lines: int) -> Array:
-    """Fraction of each line's predicted stations that were found (L,); NaN out of view."""
-    seen = np.bincount(bands.label, minlength=lines)
-    there = np.bincount(bands.label[found], minlength=lines)
-    return np.where(seen > 0, there / np.maximum(seen, 1), np.nan)
+        LinePoints(pixels, scale * sigma, label), float(worth.take(index).sum() / worth.sum()),
+        tuple(np.flatnonzero(there).tolist()), _missing(bands, index),
+        np.where(seen > 0, there / np.maximum(seen, 1), np.nan), misfit, measured.colours)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
     """Lines that should be seen plainly, of which next to nothing is among the found stations."""
     plain = bands.spacing * (2.0 * bands.half_width >= _PLAIN_WIDTH)
     seen = np.bincount(bands.label, plain)
-    there = np.bincount(bands.label[found], plain[found], minlength=len(seen))
+    there = np.bincount(bands.label.take(found), plain.take(found), minlength=len(seen))
     return tuple(np.flatnonzero((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).tolist())
 
 
@@ -298,4 +296,4 @@ def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:
     """Whether two poses agree within so many standard deviations of a covariance (3, 3)."""
     difference = a.as_array() - b.as_array()
     difference[2] = wrap_angle(difference[2])
-    return float(difference @ np.linalg.solve(covariance, difference)) <= sigmas**2
+    return float(difference @ solution(covariance, difference)) <= sigmas**2

@@ -16,10 +16,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 import math
 
 from nccs_pose.geometry.pose import Array
+from nccs_pose.vision.bands import runs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,28 +45,40 @@ def common_errors(
         of independent errors (1 for the pixels' noise alone); and the root mean square of the
         blocks' means beyond noise, px.
     """
-    edges = [0, *(np.flatnonzero(np.diff(label)) + 1).tolist(), len(label)]
-    variance = max(float(np.mean(residual**2)), 1e-12)
+    start, count = runs(label)
+    variance = max(root_mean_square(residual) ** 2, 1e-12)
     # The fit has taken three degrees of freedom, here and from the sums.
     beyond = 1.0 - max(1, len(residual) - 3) / (len(residual) * variance)
     expected = 1.0 + _PATTERN * max(0.0, beyond)
-    first = np.concatenate([
-        np.arange(start, end - _BLOCK + 1, _BLOCK) for start, end in pairwise(edges)])
-    blocks, misfit = 0.0, 0.0
-    if len(first):
-        e = residual[first[:, None] + np.arange(_BLOCK)]
-        in_px = e * sigma[first[:, None] + np.arange(_BLOCK)]
-        common = float(np.mean(np.square(in_px.mean(axis=1))))
-        noise = float(np.mean(np.square(in_px))) / _BLOCK
-        misfit = math.sqrt(max(0.0, common - noise))
-        blocks = float(np.square(e.sum(axis=1)).sum()) / (_BLOCK * variance)
-    halves = [part for start, end in pairwise(edges) if end > start + 1
-              for part in ((start, (start + end) // 2), ((start + end) // 2, end))]
-    total = np.concatenate([[0.0], np.cumsum(residual)])
-    half = sum((total[end] - total[start]) ** 2 / (end - start) for start, end in halves)
+    # Blocks go from each line's start; what is left at its end is in none.
+    whole = count // _BLOCK
+    blocks = int(whole.sum())
+    begin = (start - _BLOCK * (np.cumsum(whole) - whole)).repeat(whole)
+    member = (begin + _BLOCK * np.arange(blocks))[:, None] + np.arange(_BLOCK)
+    e, in_px = residual[member], (residual * sigma)[member]
+    # Beyond what independent errors of this size give the blocks' means.
+    beyond_noise = _square(in_px.sum(axis=1)) - _square(in_px)
+    misfit = math.sqrt(max(0.0, beyond_noise) / max(1, blocks)) / _BLOCK
+    start, count = start[count > 1], count[count > 1]
+    near, far = count // 2, count - count // 2
+    total = np.zeros(len(residual) + 1)
+    np.cumsum(residual, out=total[1:])
+    middle = total[start + near]
+    half = _square((middle - total[start]) / np.sqrt(near)) + _square(
+        (total[start + count] - middle) / np.sqrt(far))
     return max(
-        1.0, _in_common(blocks, len(first) - 3, expected),
-        _in_common(float(half) / variance, len(halves) - 3, expected)), misfit
+        1.0, _in_common(_square(e.sum(axis=1)) / (_BLOCK * variance), blocks - 3, expected),
+        _in_common(half / variance, 2 * len(start) - 3, expected)), misfit
+
+
+def root_mean_square(values: Array) -> float:
+    """Of N > 0 values (N,)."""
+    return math.sqrt(_square(values) / len(values))
+
+
+def _square(values: Array) -> float:
+    """Sum of the squares of values of any shape."""
+    return float(np.vdot(values, values))
 
 
 def _in_common(squares: float, degrees: int, expected: float) -> float:

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
+from nccs_pose.estimation.common_errors import root_mean_square
 from nccs_pose.estimation.observability import Unobserved
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
@@ -117,11 +118,10 @@ def quality_of(
     """
     sigma = points.sigma
     residual = refinement.residual[refinement.inlier]
-    told = sigma / max(float(np.sqrt(np.mean(residual**2))), 1e-9)
+    told = sigma / max(root_mean_square(residual), 1e-9)
     return Quality(
-        lines_used=len(np.unique(points.label)), points_used=len(points),
-        residual_px=float(np.sqrt(np.mean((residual * told) ** 2))),
-        expected_px=float(np.sqrt(np.mean(told**2))),
+        lines_used=int(np.count_nonzero(np.bincount(points.label))), points_used=len(points),
+        residual_px=root_mean_square(residual * told), expected_px=root_mean_square(told),
         explained=explained, claimed=claimed, ambiguity=ambiguity,
         unobserved=tuple(u.words for u in unobserved))
 

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 # Coarse samples of each line, between which its image's length is interpolated.
 _COARSE = 32
+_SLOPE = 1e-9 * np.arange(_COARSE)
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
 # So many stations at most, on all lines together.
@@ -75,7 +76,7 @@ class BandPredictor:
         self._start = line_map.starts[self._lines, :2]
         self._direction = line_map.directions[self._lines, :2]
         self._length = line_map.lengths[self._lines]
-        self._width = line_map.widths[self._lines]
+        self._half_width = 0.5 * line_map.widths[self._lines]
         self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
         self._coarse = (self._start[:, None] + self._distance[..., None]
                         * self._direction[:, None]).reshape(-1, 2)
@@ -91,21 +92,23 @@ class BandPredictor:
         lines = len(self._lines)
         pixels = self._table.pixels((self._coarse - position) @ rotation)
         visible = self._table.sees_floor(pixels).reshape(lines, _COARSE)
-        step = np.diff(pixels.reshape(lines, _COARSE, 2), axis=1)
+        curve = as_complex(pixels).reshape(lines, _COARSE)
         arc = np.zeros((lines, _COARSE))
-        np.cumsum(np.sqrt(np.einsum('lci,lci->lc', step, step))
-                  * (visible[:, 1:] & visible[:, :-1]), axis=1, out=arc[:, 1:])
+        np.cumsum(np.abs(curve[:, 1:] - curve[:, :-1]) * (visible[:, 1:] & visible[:, :-1]),
+                  axis=1, out=arc[:, 1:])
         length = np.maximum(arc[:, -1] - 2.0 * _END, 0.0)
         count = np.minimum(min(most, _MOST // max(lines, 1)), length // spacing).astype(int)
-        number = np.repeat(np.arange(lines), count)
+        number = np.arange(lines).repeat(count)
         first = np.cumsum(count) - count
-        spacing_px = (length / np.maximum(count, 1))[number]
-        where = _END + (np.arange(len(number)) - first[number] + 0.5) * spacing_px
+        each = length / np.maximum(count, 1)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden its arc is flat, and a tiny slope keeps it invertible.
         begin = np.cumsum(arc[:, -1] + 1.0) - arc[:, -1]
-        axis = (arc + 1e-9 * np.arange(_COARSE) + begin[:, None]).ravel()
-        distance = np.interp(where + begin[number], axis, self._distance.ravel())
+        axis = (arc + (_SLOPE + begin[:, None])).ravel()
+        spacing_px = each.take(number)
+        where = np.arange(0.5, len(number)) * spacing_px + (
+            begin + _END - first * each).take(number)
+        distance = np.interp(where, axis, self._distance.ravel())
         return Places(number, distance, spacing_px)
 
     def bands(
@@ -121,8 +124,9 @@ class BandPredictor:
         """
         rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
         number, distance = places.number, places.distance
-        direction = (self._direction @ rotation)[number]
-        middle = ((self._start - position) @ rotation)[number] + distance[:, None] * direction
+        direction = (self._direction @ rotation).take(number, axis=0)
+        middle = ((self._start - position) @ rotation).take(number, axis=0)
+        middle += distance[:, None] * direction
         if attitude.any():
             # Floor that sinks under a base that rises is seen where its rays met the plane.
             middle = self._table.met(middle, attitude[1] * -middle[:, 1]
@@ -136,7 +140,7 @@ class BandPredictor:
         # The cut across the tape whose image is normal to the curve leans along the line.
         speed2 = np.maximum(_dot(ahead, ahead), 1e-9)
         lean = -_dot(aside, ahead) / speed2
-        half = 0.5 * self._width[number]
+        half = self._half_width.take(number)
         across = half * (aside + lean * ahead)
         half_width = np.maximum(np.abs(across), 1e-12)
         across /= half_width
@@ -147,10 +151,10 @@ class BandPredictor:
         # Near its ends the leaning cut would leave the tape.
         reach = half * np.abs(lean)
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
-                & (distance < self._length[number] - reach))
+                & (distance < self._length.take(number) - reach))
         bands = Bands(centre, as_points(image.pixels), as_points(across),
                       as_points(-1j * across), bend, half_width, places.spacing,
-                      self._lines[number])
+                      self._lines.take(number))
         slide = self._slide(rotation, middle, image, across)
         if keep.all():
             return bands, slide
@@ -165,8 +169,9 @@ class BandPredictor:
         :param image: of the points.
         :param across: unit normals of the curves (N,).
         """
-        gradient = as_points(image.outward * (
-            _dot(image.first[0], across) + 1j * _dot(image.first[1], across)))
+        polar = np.empty(len(point), np.complex128)
+        polar.real, polar.imag = _dot(image.first[0], across), _dot(image.first[1], across)
+        gradient = as_points(image.outward * polar)
         slide = np.empty((len(point), 6))
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw.
         slide[:, :2] = -gradient @ rotation.T

@@ -22,7 +22,10 @@ pose; who predicts again at the pose found makes it exact.
 from __future__ import annotations
 
 from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.small_matrices import inverse
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.vision.bands import runs
+from nccs_pose.vision.profiles import median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,12 +72,12 @@ def solve_shifts(
     :param calibration_sigma: what the calibration may shift the whole image by, px.
     """
     free, known, expected = _prior(start, prior, attitude_sigma)
-    vague = np.diag(_VAGUE[free])
     told = known @ expected
-    known = known + vague
-    rows = np.column_stack([slide[:, free], shift]) / sigma[:, None]
-    first = _first(group)
-    members = np.diff([*first, len(group)])
+    known.flat[::len(free) + 1] += _VAGUE[free]
+    rows = np.empty((len(shift), len(free) + 1))
+    rows[:, :-1], rows[:, -1] = slide.take(free, axis=1), shift
+    rows /= sigma[:, None]
+    first, members = runs(group)
     # Of each group: the products of its rows, and their sum as one whitened row.
     products = np.add.reduceat(rows[:, :, None] * rows[:, None, :], first)
     sums = np.add.reduceat(rows, first) / np.sqrt(members)[:, None]
@@ -103,7 +106,8 @@ def solve_shifts(
         answer = covariance @ (rows[inlier, :-1].T @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     attitude = np.zeros(3)
-    attitude[np.array(free[3:], dtype=int) - 3] = unknowns[3:]
+    for unknown, value in zip(free[3:], unknowns[3:].tolist()):
+        attitude[unknown - 3] = value
     return Refinement(
         Pose2(start.x + unknowns[0], start.y + unknowns[1], start.yaw + unknowns[2]),
         0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
@@ -118,7 +122,7 @@ def _prior(
     free = [0, 1, 2] + ([3] if height > 0.0 else []) + ([4, 5] if tilt > 0.0 else [])
     information, expected = np.zeros((len(free), len(free))), np.zeros(len(free))
     if prior is not None:
-        information[:3, :3] = np.linalg.inv(prior[1])
+        information[:3, :3] = inverse(prior[1])
         expected[:3] = (prior[0].x - start.x, prior[0].y - start.y,
                         float(wrap_angle(prior[0].yaw - start.yaw)))
     for place, unknown in enumerate(free[3:], start=3):
@@ -128,13 +132,8 @@ def _prior(
 
 def pooled(e: Array, group: NDArray[np.intp]) -> Array:
     """Whitened residuals (N,) of groups of neighbours (N,), summed to whitened ones (G,)."""
-    first = _first(group)
-    return np.add.reduceat(e, first) / np.sqrt(np.diff([*first, len(e)]))
-
-
-def _first(group: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The first member of each group (G,)."""
-    return np.concatenate([[0], np.flatnonzero(group[1:] != group[:-1]) + 1])
+    first, members = runs(group)
+    return np.add.reduceat(e, first) / np.sqrt(members)
 
 
 def _normal(products: Array, weight: Array) -> tuple[Array, Array]:
@@ -150,5 +149,4 @@ def _inflation(e: Array) -> float:
 
 def _robust_scale(e: Array) -> float:
     """Standard deviation of the bulk of whitened residuals, never below the noise told."""
-    middle = len(e) // 2
-    return max(1.0, 1.4826 * float(np.partition(np.abs(e), middle)[middle]))
+    return max(1.0, 1.4826 * median(np.abs(e)))

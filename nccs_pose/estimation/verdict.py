@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.common_errors import root_mean_square
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
@@ -107,8 +108,7 @@ def is_weak(alignment: Alignment) -> bool:
 def _misfits(alignment: Alignment) -> tuple[float, float]:
     """Root mean square residual, as a multiple of the noise of the image and in px."""
     residual, told = _residuals(alignment)
-    return (float(np.sqrt(np.mean(residual**2))),
-            float(np.sqrt(np.mean((residual * told) ** 2))))
+    return root_mean_square(residual), root_mean_square(residual * told)
 
 
 def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
@@ -122,7 +122,7 @@ def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     offset, weight = residual * told, 1.0 / told**2
     total = np.maximum(np.bincount(label, weight, minlength=lines), 1e-12)
     mean = np.bincount(label, weight * offset, minlength=lines) / total
-    scatter = np.bincount(label, weight * (offset - mean[label]) ** 2, minlength=lines)
+    scatter = np.bincount(label, weight * np.square(offset - mean[label]), minlength=lines)
     count = np.maximum(np.bincount(label, minlength=lines) - 1, 1)
     return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)
 
@@ -131,7 +131,7 @@ def _residuals(alignment: Alignment) -> tuple[Array, Array]:
     """Residuals of the inliers, whitened (N,), and the noise that they were whitened by, px."""
     residual = alignment.refinement.residual[alignment.refinement.inlier]
     # The points' sigma is as it turned out.
-    return residual, alignment.points.sigma / max(float(np.sqrt(np.mean(residual**2))), 1e-9)
+    return residual, alignment.points.sigma / max(root_mean_square(residual), 1e-9)
 
 
 def _name(line_map: LineMap, k: int) -> str:

@@ -52,14 +52,14 @@ _BASES = np.hstack([
 Complex = NDArray[np.complex128]
 
 
-def _basis(t: Array) -> Array:
-    """Weights of the four coefficients for the value and two derivatives (N, 3, 4)."""
-    powers = np.empty((len(t), 4))
-    powers[:, 0] = 1.0
-    powers[:, 1] = t
-    powers[:, 2] = t * t
-    powers[:, 3] = powers[:, 2] * t
-    return (powers @ _BASES).reshape(-1, 3, 4)
+def _powers(t: Array) -> Array:
+    """1 to t^3 (..., 4)."""
+    powers = np.empty((*t.shape, 4))
+    powers[..., 0] = 1.0
+    powers[..., 1] = t
+    powers[..., 2] = t * t
+    powers[..., 3] = powers[..., 2] * t
+    return powers
 
 
 def as_complex(vectors: Array) -> Complex:
@@ -129,11 +129,13 @@ class FloorTable:
         self._last_angle = math.atan2(1.02 * reach, self.height)
         self._splines = self._forward()
         rows, self._columns = self._splines[0].shape
-        self._last_row = rows - 3.0
+        self._last_row = rows - 2.0 - 1e-9
         self._knots = np.stack(self._splines, axis=-1).reshape(-1, 2)
         self._taps = (np.arange(-1, 3)[:, None] * self._columns + np.arange(-1, 3)).ravel()
         self._grid, self._grid_reaches = self._backward()
         self.region = self._region()
+        # All that lies outside comes to lie on the frame round it.
+        self._sees_floor = np.pad(self.region > 0, 1)
 
     def _forward(self) -> tuple[Array, Array]:
         """Spline coefficients of u and v over (angle from the nadir, azimuth)."""
@@ -224,10 +226,29 @@ class FloorTable:
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
-        at = self._at(points - self.foot)
-        return np.stack(
-            [map_coordinates(spline, at, order=3, mode='nearest', prefilter=False)
-             for spline in self._splines], axis=1)
+        offset = points - self.foot
+        within, around = self._cells(offset, np.sqrt(np.einsum('ni,ni->n', offset, offset)))
+        by_a, by_b = _powers(within) @ _BASIS
+        by_row = by_a[:, None] @ around.reshape(-1, 4, 8)
+        return (by_b[:, None] @ by_row.reshape(-1, 4, 2))[:, 0]
+
+    def _cells(self, offset: Array, radius: Array) -> tuple[Array, Array]:
+        """Places within the grid's cells (2, N) by angle and azimuth, and the cells' knots.
+
+        :param offset: of floor points from the mirror's foot (N, 2), metres.
+        :param radius: its length (N,).
+        :returns: the places, 0 to 1, and the coefficients around them (N, 16, 2), by angles first.
+        """
+        at = np.empty((2, len(offset)))
+        np.multiply(np.arctan2(radius, self.height), _ANGLES / self._last_angle, out=at[0])
+        np.multiply(np.arctan2(offset[:, 1], offset[:, 0]), _AZIMUTHS / (2.0 * np.pi), out=at[1])
+        # The azimuth goes from -pi to pi, and the grid from 0.
+        at[1] += _AZIMUTHS * (at[1] < 0.0)
+        at += _PADDING
+        np.minimum(at[0], self._last_row, out=at[0])
+        cell = at.astype(np.intp)
+        first = cell[0] * self._columns + cell[1]
+        return at - cell, self._knots.take(first[:, None] + self._taps, axis=0)
 
     def expand(self, points: Array) -> FloorExpansion:
         """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
@@ -237,21 +258,20 @@ class FloorTable:
         # At the foot itself there is no direction outward; nothing is seen there but the robot.
         radius = np.maximum(radius, 1e-6)
         step_a, step_b = self._last_angle / _ANGLES, 2.0 * np.pi / _AZIMUTHS
-        a = np.arctan2(radius, self.height) / step_a + _PADDING
-        b = np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi) / step_b + _PADDING
-        a = np.minimum(a, self._last_row)
-        row, column = a.astype(int), b.astype(int)
         n = len(points)
-        around = self._knots.take((row * self._columns + column)[:, None] + self._taps, axis=0)
-        by_a = (_basis(a - row) @ around.reshape(n, 4, 8)).reshape(n, 3, 4, 2)
-        partial = _basis(b - column) @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)
+        within, around = self._cells(offset, radius)
+        basis_a, basis_b = (_powers(within) @ _BASES).reshape(2, n, 3, 4)
+        by_a = (basis_a @ around.reshape(n, 4, 8)).reshape(n, 3, 4, 2)
+        partial = basis_b @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)
         # partial[j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
         partial = np.ascontiguousarray(
             partial.view(np.complex128).reshape(n, 9).T).reshape(3, 3, n)
         p_a, p_b = partial[0, 1] / step_a, partial[1, 0] / step_b
         reach = square + self.height**2
         by_radius, inverse = self.height / reach, 1.0 / radius
-        first = np.stack([p_a * by_radius, p_b * inverse])
+        first = np.empty((2, n), np.complex128)
+        np.multiply(p_a, by_radius, out=first[0])
+        np.multiply(p_b, inverse, out=first[1])
         second = np.empty((3, n), np.complex128)
         second[0] = np.square(by_radius / step_a) * partial[0, 2] - (
             2.0 * by_radius * radius / reach) * p_a
@@ -284,10 +304,10 @@ class FloorTable:
     def sees_floor(self, pixels: Array) -> NDArray[np.bool_]:
         """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
         height, width = self.region.shape
-        column = np.rint(np.clip(pixels[:, 0], -1.0, width)).astype(int)
-        row = np.rint(np.clip(pixels[:, 1], -1.0, height)).astype(int)
-        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        return inside & (self.region[row * inside, column * inside] > 0)
+        at = np.rint(np.minimum(np.maximum(pixels, -1.0), [width, height]))
+        index = (at + 1.0) @ [1.0, width + 2.0]
+        # What is not a number becomes an index below all others, and is taken for the first.
+        return self._sees_floor.take(index.astype(np.intp), mode='clip')
 
     def floor(self, pixels: Array) -> tuple[Array, Array]:
         """Ground points (N, 2) of pixels in :attr:`region`, and d(point)/d(u, v) (N, 2, 2).

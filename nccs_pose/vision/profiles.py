@@ -123,7 +123,7 @@ def _read_pixels(
 @cache
 def _middles(count: int) -> NDArray[np.float32]:
     """The middles of so many equal parts of what reaches from -1/2 to 1/2."""
-    return (np.arange(count, dtype=np.float32) + 0.5) / count - 0.5
+    return ((np.arange(count) + 0.5) / count - 0.5).astype(np.float32)
 
 
 @cache
