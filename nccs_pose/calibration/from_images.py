@@ -127,18 +127,41 @@ def calibrate_images(
     """
     options = options or CalibrationOptions()
     parameters = RigParameters(rig, line_map, options, free_lines)
-    better, before = rig, 0
     measured = _measure_roughly(rig, line_map, images)
     on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly under the rough '
             'rig')
-    if _usable(measured) < options.min_frames:
-        better = _from_blobs(parameters, images, measured, options)
+    try:
+        measured = _follow(parameters, measured, images, options, on_pass)
+    except CalibrationError:
+        better = _from_blobs(parameters, images, options)
+        if better is None:
+            raise
         measured = _measure_roughly(better, line_map, images)
         on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly after a first '
                 'guess from the blobs of the lines')
-    if not measured.frames:
+        if not measured.frames:
+            raise
+        measured = _follow(parameters, measured, images, options, on_pass)
+    result = calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+    # The noise was measured with what the last rig left in the residuals; now it is clean.
+    measured = measure(result.model.rig, result.model.line_map, images())
+    if _usable(measured) == 0:
         raise CalibrationError(_nothing(measured))
+    return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+
+
+def _follow(
+    parameters: RigParameters, measured: Measured, images: Images, options: CalibrationOptions,
+    on_pass: Callable[[str], None],
+) -> Measured:
+    """Refine the rig and follow more images under it, in turn, until they become no more.
+
+    :raises CalibrationError: if nothing explains what was measured, or too little was.
+    """
+    line_map, before = parameters.rough.line_map, 0
     for _ in range(_PASSES):
+        if _usable(measured) < min(options.min_frames, measured.seen):
+            raise CalibrationError(_nothing(measured))
         theta = converge(parameters, measured.frames, measured.poses, options)
         better = parameters.model(theta, with_rim=True).rig
         measured = measure(better, line_map, images())
@@ -148,14 +171,7 @@ def calibrate_images(
         if len(measured.frames) <= before:
             break
         before = len(measured.frames)
-    if _usable(measured) == 0:
-        raise CalibrationError(_nothing(measured))
-    result = calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
-    # The noise was measured with what the last rig left in the residuals; now it is clean.
-    measured = measure(result.model.rig, result.model.line_map, images())
-    if _usable(measured) == 0:
-        raise CalibrationError(_nothing(measured))
-    return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+    return measured
 
 
 def _measure_roughly(rig: Rig, line_map: LineMap, images: Images) -> Measured:
@@ -176,12 +192,15 @@ def _nothing(measured: Measured) -> str:
 
 
 def _from_blobs(
-    parameters: RigParameters, images: Images, measured: Measured, options: CalibrationOptions,
-) -> Rig:
-    """A better rig from what has the lines' colour, each blob one line."""
+    parameters: RigParameters, images: Images, options: CalibrationOptions,
+) -> Rig | None:
+    """A better rig from what has the lines' colour, each blob one line; None if there is none."""
     rough = parameters.rough
     frames, poses = label_blobs(rough.rig, rough.line_map, images())
     if len(frames) < 3:
-        raise CalibrationError(_nothing(measured))
-    theta = converge(parameters, frames, poses, options)
+        return None
+    try:
+        theta = converge(parameters, frames, poses, options)
+    except CalibrationError:
+        return None
     return parameters.model(theta, with_rim=True).rig
