@@ -36,6 +36,7 @@ setup(
     install_requires=['numpy', 'scipy', 'PyYAML'],
     extras_require={
         'pip': ['opencv-python-headless', 'rosbags', 'matplotlib', 'joblib'],
+        'test': ['pytest'],  # without it `colcon test` runs nothing, and says OK
     },
     zip_safe=True,
     maintainer='The nccs_pose authors',
