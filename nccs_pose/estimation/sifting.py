@@ -29,7 +29,7 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.verdict import Objection
+from nccs_pose.estimation.verdict import lines_used, Objection
 from nccs_pose.geometry.pose import Pose2
 
 # Candidates that are laid on the image.
@@ -38,6 +38,8 @@ _TRIED = 6
 _SEARCH_BAND = 5.0
 # Only those count that score this fraction of the best.
 _WORTH_TRYING = 0.6
+# Out of nothing, a pose on no more lines than these is open to doubt.
+_FEW = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +123,15 @@ class Sifter:
             if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
                 continue
             seen.append(alignment.pose)
+            expected = is_expected(alignment, prediction, options.innovation_gate)
             found = self._judge.found(
-                sight.image, alignment, sight.segments, doubts,
-                expected=is_expected(alignment, prediction, options.innovation_gate))
+                sight.image, alignment, sight.segments, doubts, expected=expected)
+            if isinstance(found, Found) and not expected and self._doubtful(
+                    start, found, sight):
+                found = Objection(
+                    'it rests on few lines, and another pose explains what is seen as '
+                    'well',
+                    hidden=True)
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found.hidden:
@@ -136,6 +144,18 @@ class Sifter:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)
         return sifted
+
+    def _doubtful(self, start: _Start, found: Found, sight: Sight) -> bool:
+        """Whether the strips speak about as much for another pose as for one on few lines.
+
+        Where an image is so coarse that the right pose cannot be laid on it, the next may be.
+        """
+        if start.score is None or lines_used(found.alignment) > _FEW:
+            return False
+        least = self._options.ambiguity_ratio * _by_strips(start.score, start.misfit)
+        return any(
+            _by_strips(c.score, c.misfit) >= least
+            and not same_pose(c.pose, found.alignment.pose) for c in sight.candidates)
 
     def _rivals(self, start: _Start, held_from: _Start, held: Found) -> bool:
         """Whether what a pose shows on the strips leaves it a chance against one that holds.
@@ -151,3 +171,8 @@ class Sifter:
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
         return math.sqrt(start.score) * fit_of(excess) >= ratio * held.score
+
+
+def _by_strips(score: float, misfit: float) -> float:
+    """What the strips alone promise of a pose, 0 to 1."""
+    return math.sqrt(score) * fit_of(misfit**2)
