@@ -31,6 +31,7 @@ from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.verdict import lines_used, Objection
 from nccs_pose.geometry.pose import Pose2
+import numpy as np
 
 # Candidates that are laid on the image.
 _TRIED = 6
@@ -40,6 +41,8 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.6
 # Out of nothing, a pose on no more lines than these is open to doubt.
 _FEW = 3
+# An image on which lines lie as well as this shows by itself which of two poses is right.
+_SHARP = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +129,9 @@ class Sifter:
             expected = is_expected(alignment, prediction, options.innovation_gate)
             found = self._judge.found(
                 sight.image, alignment, sight.segments, doubts, expected=expected)
-            if isinstance(found, Found) and not expected and self._doubtful(
-                    start, found, sight):
+            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
                 found = Objection(
-                    'it rests on few lines, and another pose explains what is seen as '
-                    'well',
-                    hidden=True)
+                    'it rests on few lines, and another pose shows about as much', hidden=True)
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found.hidden:
@@ -145,17 +145,19 @@ class Sifter:
         sifted.held.sort(key=lambda f: -f.score)
         return sifted
 
-    def _doubtful(self, start: _Start, found: Found, sight: Sight) -> bool:
-        """Whether the strips speak about as much for another pose as for one on few lines.
+    def _doubtful(self, found: Found, sight: Sight) -> bool:
+        """Whether the strips speak as much for another pose as for one on few lines.
 
-        Where an image is so coarse that the right pose cannot be laid on it, the next may be.
+        An image so coarse that its lines lie badly on it is no verdict on the other: the right
+        pose may not be laid on it at all, and the next may be.
         """
-        if start.score is None or lines_used(found.alignment) > _FEW:
+        alignment = found.alignment
+        sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
+        if sharp or lines_used(alignment) > _FEW or explains_nearly_all(found):
             return False
-        least = self._options.ambiguity_ratio * _by_strips(start.score, start.misfit)
-        return any(
-            _by_strips(c.score, c.misfit) >= least
-            and not same_pose(c.pose, found.alignment.pose) for c in sight.candidates)
+        least = self._options.ambiguity_ratio * found.by_strips
+        return any(c.score >= least and not same_pose(c.pose, alignment.pose)
+                   for c in sight.candidates)
 
     def _rivals(self, start: _Start, held_from: _Start, held: Found) -> bool:
         """Whether what a pose shows on the strips leaves it a chance against one that holds.
@@ -171,8 +173,3 @@ class Sifter:
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
         return math.sqrt(start.score) * fit_of(excess) >= ratio * held.score
-
-
-def _by_strips(score: float, misfit: float) -> float:
-    """What the strips alone promise of a pose, 0 to 1."""
-    return math.sqrt(score) * fit_of(misfit**2)
