@@ -19,6 +19,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass
 
+from nccs_pose.estimation.small_matrices import inverse, inverse_3x3
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 import numpy as np
 
@@ -83,10 +84,11 @@ class Prediction:
         :param covariance: of the pose: a multiple of the solve's, and more.
         :param solved: of the solve, which had :attr:`covariance` as its prior.
         """
-        gain = solved @ np.linalg.inv(self.covariance)
-        multiple = max(1.0, float(np.trace(covariance) / np.trace(solved)))
-        narrowed = covariance - gain @ (multiple * self.covariance - self.carried) @ gain.T
-        return narrowed if np.linalg.eigvalsh(narrowed)[0] > 0.0 else covariance
+        prior = self.covariance
+        gain = solved @ inverse(prior)
+        multiple = max(1.0, float(covariance.trace() / solved.trace()))
+        narrowed = covariance - gain @ (multiple * prior - self.carried) @ gain.T
+        return covariance if inverse_3x3(narrowed) is None else narrowed
 
 
 FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])

@@ -176,8 +176,8 @@ class BandPredictor:
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw.
         slide[:, :2] = -gradient @ rotation.T
         slide[:, 2] = gradient[:, 0] * point[:, 1] - gradient[:, 1] * point[:, 0]
-        # Floor that sinks by dz is seen where the ray would have met it.
-        slide[:, 3] = -np.einsum('ni,ni->n', gradient, self._table.falls(image.offset))
+        # Floor that sinks by dz is seen where the ray would have met it, further out.
+        slide[:, 3] = -polar.real * self._table.falls(image.radius)
         slide[:, 4] = slide[:, 3] * point[:, 1]
         slide[:, 5] = -slide[:, 3] * point[:, 0]
         return slide

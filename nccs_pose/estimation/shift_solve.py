@@ -28,6 +28,7 @@ from nccs_pose.vision.bands import runs
 from nccs_pose.vision.profiles import median
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
@@ -78,29 +79,29 @@ def solve_shifts(
     rows[:, :-1], rows[:, -1] = slide.take(free, axis=1), shift
     rows /= sigma[:, None]
     first, members = runs(group)
-    # Of each group: the products of its rows, and their sum as one whitened row.
-    products = np.add.reduceat(rows[:, :, None] * rows[:, None, :], first)
+    # The sum of each group's rows as one whitened row.
     sums = np.add.reduceat(rows, first) / np.sqrt(members)[:, None]
     unknowns: NDArray[np.floating] = np.zeros(len(free))
     e, scale = sums[:, -1], 1.0
     for _ in range(_ITERATIONS):
         scale = _robust_scale(e)
-        normal, right = _normal(products, 1.0 / (1.0 + np.square(e / (_CAUCHY * scale))))
+        weight = 1.0 / (1.0 + np.square(e / (_CAUCHY * scale)))
+        normal, right = _normal(rows, weight.repeat(members))
         normal += known
         before = unknowns
-        unknowns = np.linalg.solve(normal, right + told)
+        unknowns = _solution(normal, right + told)
         e = sums[:, -1] - sums[:, :-1] @ unknowns
         step = unknowns - before
         if step @ normal @ step < 1e-2:
             break
     trusted = np.abs(e) <= _GATE * _robust_scale(e)
-    normal, right = _normal(products, trusted.astype(float))
+    inlier = trusted.repeat(members)
+    normal, right = _normal(rows, inlier.astype(float))
     # The prior's share is weighed against residuals of the size that they have.
     inflation = _inflation(e[trusted])
-    unknowns = np.linalg.solve(normal / inflation + known, right / inflation + told)
+    unknowns = _solution(normal / inflation + known, right / inflation + told)
     inflation = _inflation((sums[:, -1] - sums[:, :-1] @ unknowns)[trusted])
-    covariance = np.linalg.inv(normal / inflation + known)
-    inlier = np.repeat(trusted, members)
+    covariance = _solution(normal / inflation + known, np.eye(len(free)))
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
         answer = covariance @ (rows[inlier, :-1].T @ moved) * (calibration_sigma / inflation)
@@ -136,10 +137,21 @@ def pooled(e: Array, group: NDArray[np.intp]) -> Array:
     return np.add.reduceat(e, first) / np.sqrt(members)
 
 
-def _normal(products: Array, weight: Array) -> tuple[Array, Array]:
-    """Normal matrix and right side of the groups' rows (G, K, K) under weights (G,)."""
-    weighed = (weight @ products.reshape(len(weight), -1)).reshape(products.shape[1:])
+def _normal(rows: Array, weight: Array) -> tuple[Array, Array]:
+    """Normal matrix and right side of rows (N, K) under weights (N,)."""
+    weighed = (rows.T * weight) @ rows
     return weighed[:-1, :-1], weighed[:-1, -1]
+
+
+def _solution(matrix: Array, right: Array) -> Array:
+    """Solution of a symmetric, positive definite system.
+
+    :raises numpy.linalg.LinAlgError: where it is not.
+    """
+    _, found, failed = dposv(matrix, right)
+    if failed:
+        raise np.linalg.LinAlgError('the normal equations are not positive definite')
+    return np.asarray(found)
 
 
 def _inflation(e: Array) -> float:

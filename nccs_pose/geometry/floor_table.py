@@ -80,14 +80,14 @@ class FloorExpansion:
     each point's own polar basis, away from the mirror's foot and round it.
 
     :ivar pixels: (N,).
-    :ivar offset: of the points from the mirror's foot (N, 2), metres.
+    :ivar radius: of the points from the mirror's foot (N,), metres.
     :ivar outward: unit vector away from the mirror's foot (N,), in base_link.
     :ivar first: derivative of the pixels outward and round (2, N), px per metre.
     :ivar second: outward twice, mixed, and round twice (3, N), px per square metre.
     """
 
     pixels: Complex
-    offset: Array
+    radius: Array
     outward: Complex
     first: Complex
     second: Complex
@@ -136,6 +136,7 @@ class FloorTable:
         self.region = self._region()
         # All that lies outside comes to lie on the frame round it.
         self._sees_floor = np.pad(self.region > 0, 1)
+        self._beyond = np.array([rig.camera.width, rig.camera.height], dtype=float)
 
     def _forward(self) -> tuple[Array, Array]:
         """Spline coefficients of u and v over (angle from the nadir, azimuth)."""
@@ -192,14 +193,12 @@ class FloorTable:
         return radius[rows, 0], np.array(
             [float(np.mean((outward[row] / fall[row])[seen[row]])) for row in rows])
 
-    def falls(self, offset: Array) -> Array:
-        """How far a ray goes over the floor (N, 2) for each metre that it falls, in base_link.
+    def falls(self, radius: Array) -> Array:
+        """How far outward over the floor a ray goes for each metre that it falls (N,).
 
-        :param offset: where it meets the floor, from the mirror's foot (N, 2), metres.
+        :param radius: where it meets the floor, from the mirror's foot (N,), metres.
         """
-        radius = np.sqrt(np.einsum('ni,ni->n', offset, offset))
-        outward = np.interp(radius, *self._falls)
-        return offset * (outward / np.maximum(radius, 1e-9))[:, None]
+        return np.interp(radius, *self._falls)
 
     def met(self, points: Array, rise: Array) -> Array:
         """Where rays that see points over the floor meet it (N, 2), in base_link.
@@ -261,11 +260,10 @@ class FloorTable:
         n = len(points)
         within, around = self._cells(offset, radius)
         basis_a, basis_b = (_powers(within) @ _BASES).reshape(2, n, 3, 4)
-        by_a = (basis_a @ around.reshape(n, 4, 8)).reshape(n, 3, 4, 2)
-        partial = basis_b @ by_a.transpose(0, 2, 1, 3).reshape(n, 4, 6)
+        by_a = (basis_a @ around.reshape(n, 4, 8)).view(np.complex128)
         # partial[j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
         partial = np.ascontiguousarray(
-            partial.view(np.complex128).reshape(n, 9).T).reshape(3, 3, n)
+            (by_a @ basis_b.transpose(0, 2, 1).astype(np.complex128)).transpose(2, 1, 0))
         p_a, p_b = partial[0, 1] / step_a, partial[1, 0] / step_b
         reach = square + self.height**2
         by_radius, inverse = self.height / reach, 1.0 / radius
@@ -278,7 +276,7 @@ class FloorTable:
         second[1] = (inverse * by_radius / (step_a * step_b)) * partial[1, 1] - inverse * first[1]
         second[2] = np.square(inverse / step_b) * partial[2, 0] + inverse * first[0]
         return FloorExpansion(
-            partial[0, 0], offset, as_complex(offset) * inverse, first, second)
+            partial[0, 0], radius, as_complex(offset) * inverse, first, second)
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
@@ -303,9 +301,8 @@ class FloorTable:
 
     def sees_floor(self, pixels: Array) -> NDArray[np.bool_]:
         """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
-        height, width = self.region.shape
-        at = np.rint(np.minimum(np.maximum(pixels, -1.0), [width, height]))
-        index = (at + 1.0) @ [1.0, width + 2.0]
+        at = np.rint(np.minimum(np.maximum(pixels, -1.0), self._beyond)) + 1.0
+        index = at[:, 0] + at[:, 1] * (self._beyond[0] + 2.0)
         # What is not a number becomes an index below all others, and is taken for the first.
         return self._sees_floor.take(index.astype(np.intp), mode='clip')
 

@@ -151,7 +151,7 @@ def _products(
         and the floor's colour (3,), which the channels are less.
     """
     n, count = s.shape
-    floor = np.array(cv2.mean(pixels[:, :1])[:3])
+    floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
     wide = np.float32(1.0 / blur) * half_width.astype(np.float32)[:, None]
     edges = np.empty((2, n, count), np.float32)
     scaled = s * np.float32(1.0 / blur)
@@ -166,17 +166,17 @@ def _products(
     square *= np.float32(-0.5)
     steep = np.exp(square, out=square)
     edges *= steep
-    rows = np.empty((n, 8, count), np.float32)
-    np.subtract(rise[0], rise[1], out=rows[:, 0])
-    np.subtract(steep[1], steep[0], out=rows[:, 1])
-    rows[:, 2] = s
-    np.subtract(edges[1], edges[0], out=rows[:, 3])
+    rows = np.empty((8, n, count), np.float32)
+    np.subtract(rise[0], rise[1], out=rows[0])
+    np.subtract(steep[1], steep[0], out=rows[1])
+    rows[2] = s
+    np.subtract(edges[1], edges[0], out=rows[3])
     # Numbers about zero keep their digits in sums of squares.
     for k, channel in enumerate(cv2.split(pixels)):
-        np.subtract(channel, np.float32(floor[k]), out=rows[:, 4 + k])
-    rows[:, 7] = 1.0
+        np.subtract(channel, floor[k], out=rows[4 + k])
+    rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
-    products = rows[:, :7] @ rows.transpose(0, 2, 1)
+    products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
     return products * (scale[:7, None] * scale), floor
