@@ -59,7 +59,8 @@ def common_errors(
     # Beyond what independent errors of this size give the blocks' means.
     beyond_noise = _square(in_px.sum(axis=1)) - _square(in_px)
     misfit = math.sqrt(max(0.0, beyond_noise) / max(1, blocks)) / _BLOCK
-    start, count = start[count > 1], count[count > 1]
+    long = count > 1
+    start, count = start[long], count[long]
     near, far = count // 2, count - count // 2
     total = np.zeros(len(residual) + 1)
     np.cumsum(residual, out=total[1:])

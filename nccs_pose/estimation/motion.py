@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+import math
 
 from nccs_pose.estimation.small_matrices import inverse, inverse_3x3
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
@@ -134,9 +135,10 @@ class Odometry:
 def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two stamps."""
     step = before.inverse() @ after
-    distance, angle = float(np.hypot(step.x, step.y)), abs(step.yaw)
-    sigma = _PER_METRE[0] * np.sqrt(distance)
-    sigma_yaw = np.hypot(_PER_METRE[1] * np.sqrt(distance), _YAW_PER_RADIAN * np.sqrt(angle))
+    distance, angle = math.hypot(step.x, step.y), abs(step.yaw)
+    sigma = _PER_METRE[0] * math.sqrt(distance)
+    sigma_yaw = math.hypot(
+        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle))
     return Prediction(pose @ step, _carried(pose, covariance, step, sigma, sigma_yaw), True)
 
 

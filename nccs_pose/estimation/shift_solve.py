@@ -23,12 +23,12 @@ from __future__ import annotations
 
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.small_matrices import inverse
+from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 from nccs_pose.vision.bands import runs
 from nccs_pose.vision.profiles import median
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
@@ -89,7 +89,7 @@ def solve_shifts(
         normal, right = _normal(rows, weight.repeat(members))
         normal += known
         before = unknowns
-        unknowns = _solution(normal, right + told)
+        unknowns = definite_solution(normal, right + told)
         e = sums[:, -1] - sums[:, :-1] @ unknowns
         step = unknowns - before
         if step @ normal @ step < 1e-2:
@@ -99,9 +99,9 @@ def solve_shifts(
     normal, right = _normal(rows, inlier.astype(float))
     # The prior's share is weighed against residuals of the size that they have.
     inflation = _inflation(e[trusted])
-    unknowns = _solution(normal / inflation + known, right / inflation + told)
+    unknowns = definite_solution(normal / inflation + known, right / inflation + told)
     inflation = _inflation((sums[:, -1] - sums[:, :-1] @ unknowns)[trusted])
-    covariance = _solution(normal / inflation + known, np.eye(len(free)))
+    covariance = definite_solution(normal / inflation + known, np.eye(len(free)))
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
         answer = covariance @ (rows[inlier, :-1].T @ moved) * (calibration_sigma / inflation)
@@ -141,17 +141,6 @@ def _normal(rows: Array, weight: Array) -> tuple[Array, Array]:
     """Normal matrix and right side of rows (N, K) under weights (N,)."""
     weighed = (rows.T * weight) @ rows
     return weighed[:-1, :-1], weighed[:-1, -1]
-
-
-def _solution(matrix: Array, right: Array) -> Array:
-    """Solution of a symmetric, positive definite system.
-
-    :raises numpy.linalg.LinAlgError: where it is not.
-    """
-    _, found, failed = dposv(matrix, right)
-    if failed:
-        raise np.linalg.LinAlgError('the normal equations are not positive definite')
-    return np.asarray(found)
 
 
 def _inflation(e: Array) -> float:

@@ -21,6 +21,7 @@ from functools import cached_property
 import math
 
 from nccs_pose.errors import VisionError
+from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import Array
 import numpy as np
 
@@ -81,7 +82,7 @@ class LineColour:
     @cached_property
     def discriminant(self) -> Array:
         """Fisher's weights (3,) on B, G, R, scaled so that the tape's contrast is 1."""
-        weights = np.linalg.solve(self.clutter, self.contrast).astype(float)
+        weights = definite_solution(self.clutter, self.contrast)
         return weights / float(weights @ self.contrast)
 
     def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:

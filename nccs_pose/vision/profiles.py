@@ -139,24 +139,24 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 def _products(
     pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, blur: float,
-) -> tuple[Array, Array]:
-    """What every station says, in the products of templates and image with each other.
+    first: NDArray[np.intp],
+) -> tuple[Array, Array, Array]:
+    """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
     is the profile, D = dT/d(delta) and B = dT/d(blur).
 
     :param pixels: (N, P, 3) BGR.
     :param s: their place across the curve (N, P), px.
-    :returns: products of T, D, s, B and the three channels with each other and with 1 (N, 7, 8);
-        and the floor's colour (3,), which the channels are less.
+    :param first: station of each group (G,).
+    :returns: products of T, D, s, B and the three channels with each other and with 1, summed
+        over each group (G, 7, 8); those with D of each station (N, 8); and the floor's colour
+        (3,), which the channels are less.
     """
     n, count = s.shape
     floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
-    wide = np.float32(1.0 / blur) * half_width.astype(np.float32)[:, None]
-    edges = np.empty((2, n, count), np.float32)
-    scaled = s * np.float32(1.0 / blur)
-    np.add(scaled, wide, out=edges[0])
-    np.subtract(scaled, wide, out=edges[1])
+    wide = (half_width / blur).astype(np.float32)[:, None]
+    edges = s * np.float32(1.0 / blur) + np.stack([wide, -wide])
     square = np.square(edges)
     # tanh of a cubic is the normal distribution to 0.0003, at a tenth of the cost.
     rise = square * np.float32(0.0356774)
@@ -179,7 +179,8 @@ def _products(
     products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    return products * (scale[:7, None] * scale), floor
+    return (np.add.reduceat(products, first, axis=0) * (scale[:7, None] * scale),
+            products[:, 1] * (steepness * scale), floor)
 
 
 class _Groups(NamedTuple):
@@ -221,9 +222,8 @@ def fit_profiles(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.mean())), _MOST_ALONG), 1)
     pixels, s = _read_pixels(image, bands, margin, rows)
-    products, floor = _products(pixels, s, bands.half_width, blur)
     groups, count = _Groups.of(bands), s.shape[1]
-    pooled = np.add.reduceat(products, groups.first, axis=0)
+    pooled, by_shift, floor = _products(pixels, s, bands.half_width, blur, groups.first)
     size = count * groups.members
     means = pooled[:, :, 7] / size[:, None]
     centred = pooled[:, :, :7] - means[:, :, None] * pooled[:, None, :, 7]
@@ -235,7 +235,7 @@ def fit_profiles(
     repeats = np.maximum(rows / bands.spacing, 1.0) * np.maximum(
         count / rows / (2.0 * (bands.half_width + margin)), 1.0)
     fit, shared = _shifts(
-        products, means, system, colour.discriminant, groups, size, bands, repeats)
+        by_shift, means, system, colour.discriminant, groups, size, bands, repeats)
     # A template beside its tape would take the misfit for blur.
     if not rough and median(np.abs(shared)) < _SHARP_PX:
         share = centred[:, 3, 0] / system.power
@@ -294,12 +294,12 @@ def _eliminated(products: Array) -> _System:
 
 
 def _shifts(
-    products: Array, means: Array, system: _System, weights: Array, groups: _Groups,
+    by_shift: Array, means: Array, system: _System, weights: Array, groups: _Groups,
     size: NDArray[np.intp], bands: Bands, repeats: Array,
 ) -> tuple[ProfileFit, Array]:
     """Shifts and their noise along a colour's discriminant.
 
-    :param products: of the stations (N, 7, 8).
+    :param by_shift: products of the stations with D (N, 8).
     :param means: of T, D, s, B and the channels over each group (G, 7).
     :param weights: the discriminant (3,).
     :param size: samples of each group (G,).
@@ -333,10 +333,9 @@ def _shifts(
     height = a - system.by_slope * tilt
     base = means[:, 4:] @ weights - height * means[:, 0] - moved * means[:, 1] - tilt * means[:, 2]
     of = groups.number
-    by_template = products[:, 1]
-    own_power = np.maximum(by_template[:, 1], 1e-9)
-    own = (by_template[:, 4:7] @ weights - height[of] * by_template[:, 0]
-           - tilt[of] * by_template[:, 2] - base[of] * by_template[:, 7])
+    own_power = np.maximum(by_shift[:, 1], 1e-9)
+    own = (by_shift[:, 4:7] @ weights - height[of] * by_shift[:, 0]
+           - tilt[of] * by_shift[:, 2] - base[of] * by_shift[:, 7])
     part = own_power / np.add.reduceat(own_power, groups.first)[of]
     sigma = np.sqrt(variance[of] / (part * shift_power[of])) / smooth[of]
     return ProfileFit(
