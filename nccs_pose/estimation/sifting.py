@@ -29,7 +29,7 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.verdict import lines_used, Objection
+from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
@@ -39,8 +39,6 @@ _TRIED = 6
 _SEARCH_BAND = 5.0
 # Only those count that score this fraction of the best.
 _WORTH_TRYING = 0.6
-# Out of nothing, a pose on no more lines than these is open to doubt.
-_FEW = 3
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
 
@@ -131,7 +129,8 @@ class Sifter:
                 sight.image, alignment, sight.segments, doubts, expected=expected)
             if isinstance(found, Found) and not expected and self._doubtful(found, sight):
                 found = Objection(
-                    'it rests on few lines, and another pose shows about as much', hidden=True)
+                    'its lines lie badly on the image, and another pose shows about as much',
+                    hidden=True)
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found.hidden:
@@ -146,14 +145,14 @@ class Sifter:
         return sifted
 
     def _doubtful(self, found: Found, sight: Sight) -> bool:
-        """Whether the strips speak as much for another pose as for one on few lines.
+        """Whether the strips speak as much for another pose, and the image for neither.
 
-        An image so coarse that its lines lie badly on it is no verdict on the other: the right
-        pose may not be laid on it at all, and the next may be.
+        An image so coarse that lines lie badly on it is no verdict on another pose: the right one
+        may not be laid on it at all, and the next may be.
         """
         alignment = found.alignment
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        if sharp or lines_used(alignment) > _FEW or explains_nearly_all(found):
+        if sharp or explains_nearly_all(found):
             return False
         least = self._options.ambiguity_ratio * found.by_strips
         return any(c.score >= least and not same_pose(c.pose, alignment.pose)
