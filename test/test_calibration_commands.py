@@ -70,7 +70,11 @@ def test_a_rough_rig_goes_in_and_a_good_one_comes_out(drive, files, tmp_path, ca
     code = main(['calibrate', str(drive), '--rig', written('rough.yaml', rough), '--map', line_map,
                  '--output', str(output)])
     assert code == 0
-    assert capsys.readouterr().out.startswith('to be used: residuals went from')
+    said = capsys.readouterr()
+    assert said.out.startswith('to be used: residuals went from')
+    # Poses that are doubted are enough to begin with; nothing had to be asked of blobs.
+    assert 'followed roughly under the rough rig' in said.err
+    assert 'blobs' not in said.err
     found = load_rig(output)
     assert np.abs(found.cop - true.cop).max() < 2e-5
     assert found.camera == true.camera

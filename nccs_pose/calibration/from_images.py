@@ -39,6 +39,7 @@ Image = NDArray[np.uint8]
 Images = Callable[[], Iterable[tuple[int, Image]]]
 
 _PASSES = 4
+_FEWEST = 2  # images that a better rig may be estimated from, to follow more under it
 _LEAST_LINES = 2
 _LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
 # A rough rig fits a single image better if that image may have a height and a tilt of its own.
@@ -160,7 +161,7 @@ def _follow(
     """
     line_map, before = parameters.rough.line_map, 0
     for _ in range(_PASSES):
-        if _usable(measured) < min(options.min_frames, measured.seen):
+        if _usable(measured) < _FEWEST:
             raise CalibrationError(_nothing(measured))
         theta = converge(parameters, measured.frames, measured.poses, options)
         better = parameters.model(theta, with_rim=True).rig
@@ -171,6 +172,8 @@ def _follow(
         if len(measured.frames) <= before:
             break
         before = len(measured.frames)
+    if _usable(measured) < min(options.min_frames, measured.seen):
+        raise CalibrationError(_nothing(measured))
     return measured
 
 
