@@ -26,7 +26,7 @@ from nccs_pose.estimation.shift_solve import pooled, solve_shifts
 from nccs_pose.estimation.small_matrices import solution
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
@@ -165,8 +165,7 @@ class Aligner:
             result = _alignment(measured, self._lines)
             if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
                 return None
-            step = result.pose.as_array() - pose.as_array()
-            step[2] = wrap_angle(step[2])
+            step = result.pose.minus(pose)
             sharpest = min(colour.blur for colour in colours)
             learned = max(abs(a.blur - b.blur) for a, b in zip(known, colours))
             settled = learned < _LEARNED_BLUR and (
@@ -254,11 +253,10 @@ class Aligner:
             (fit.shift + slide[:, 3:] @ attitude).take(at), fit.sigma.take(at),
             slide.take(at, axis=0), fit.group.take(at), bands.across.take(at, axis=0), start,
             prior)
-        step = np.array([refinement.pose.x - start.x, refinement.pose.y - start.y,
-                         float(wrap_angle(refinement.pose.yaw - start.yaw)),
-                         *(refinement.attitude - attitude)])
-        moved = float(np.abs(slide @ step).max())
-        return _Measured(refinement, bands, fit, used, moved, colours)
+        moved = slide[:, :3] @ refinement.pose.minus(start) + slide[:, 3:] @ (
+            refinement.attitude - attitude)
+        return _Measured(
+            refinement, bands, fit, used, float(np.abs(moved).max()), colours)
 
 
 def _alignment(measured: _Measured, lines: int) -> Alignment:
@@ -294,6 +292,5 @@ def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:
     """Whether two poses agree within so many standard deviations of a covariance (3, 3)."""
-    difference = a.as_array() - b.as_array()
-    difference[2] = wrap_angle(difference[2])
+    difference = a.minus(b)
     return float(difference @ solution(covariance, difference)) <= sigmas**2

@@ -101,20 +101,18 @@ class Judge:
         found = objection(alignment, self._map, self._options, expected=expected)
         # Out of nothing every line in view is looked at, else those that leave a question.
         least = _WEAK if expected else np.inf
-        with np.errstate(invalid='ignore'):
-            asked = np.flatnonzero(alignment.support < least)
-        asked = np.union1d(asked, [k for k in sorted(doubts) if alignment.support[k] >= 0.0])
-        if found is not None or len(asked) == 0:
+        asked = {*np.flatnonzero(alignment.support < least).tolist(),
+                 *(k for k in doubts if alignment.support[k] >= 0.0)}
+        if found is not None or not asked:
             return found
-        plain = plainly_in_place(alignment, self._map, self._table)
-        asked = np.array([k for k in asked.tolist() if k not in plain], dtype=np.intp)
-        if len(asked) == 0:
+        asked -= plainly_in_place(alignment, self._map, self._table)
+        if not asked:
             return None
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
         places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
         bands, slide = self._predictor.bands(places, alignment.pose)
         moved = slide[:, 3:] @ alignment.refinement.attitude
-        for k in asked.tolist():
+        for k in sorted(asked):
             line, own = self._map[k], bands.label == k
             seen = placement(
                 image, k, bands[own], moved[own], colours[line.colour], self._options.band,

@@ -24,7 +24,7 @@ from __future__ import annotations
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.small_matrices import inverse
 from nccs_pose.geometry.definite import definite_solution
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import runs
 from nccs_pose.vision.profiles import median
 import numpy as np
@@ -124,8 +124,7 @@ def _prior(
     information, expected = np.zeros((len(free), len(free))), np.zeros(len(free))
     if prior is not None:
         information[:3, :3] = inverse(prior[1])
-        expected[:3] = (prior[0].x - start.x, prior[0].y - start.y,
-                        float(wrap_angle(prior[0].yaw - start.yaw)))
+        expected[:3] = prior[0].minus(start)
     for place, unknown in enumerate(free[3:], start=3):
         information[place, place] = (height if unknown == 3 else tilt) ** -2.0
     return free, information, expected

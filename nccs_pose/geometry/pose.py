@@ -66,6 +66,10 @@ class Pose2:
         """Return (x, y, yaw) as an array (3,)."""
         return np.array([self.x, self.y, self.yaw])
 
+    def minus(self, other: Pose2) -> Array:
+        """Return (x, y, yaw) less another's as an array (3,), the difference of angles wrapped."""
+        return Pose2(self.x - other.x, self.y - other.y, self.yaw - other.yaw).as_array()
+
     @property
     def rotation(self) -> Array:
         """The rotation about z, (3, 3)."""
