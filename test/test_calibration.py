@@ -460,6 +460,17 @@ def test_the_pose_error_of_an_uncertain_rig_is_that_of_sampled_rigs():
     assert told.base_position == pytest.approx(np.hypot(*errors.mean(axis=0)[:2]), rel=0.2)
 
 
+def test_simulated_stations_stand_evenly_in_the_image():
+    frames, poses = measured_frames(
+        RIGS['hyperbolic'], LINES, 4, np.random.default_rng(0), sigma=1e-6, points=40)
+    for frame, pose in zip(frames, poses):
+        for line, side in set(zip(frame.points.label, frame.side)):
+            own = frame.points.pixels[(frame.points.label == line) & (frame.side == side)]
+            step = np.linalg.norm(np.diff(own, axis=0), axis=1)
+            # Evenly spread over the floor they would differ by a factor of up to seven.
+            assert step.max() < 1.6 * step.min()
+
+
 def test_cells_average_what_falls_into_them():
     rng = np.random.default_rng(0)
     at = rng.uniform(0.0, 1.0, (4000, 2))
