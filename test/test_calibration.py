@@ -461,11 +461,11 @@ def test_the_pose_error_of_an_uncertain_rig_is_that_of_sampled_rigs():
 
 
 def test_simulated_stations_stand_evenly_in_the_image():
-    frames, poses = measured_frames(
+    frames, _ = measured_frames(
         RIGS['hyperbolic'], LINES, 4, np.random.default_rng(0), sigma=1e-6, points=40)
-    for frame, pose in zip(frames, poses):
-        for line, side in set(zip(frame.points.label, frame.side)):
-            own = frame.points.pixels[(frame.points.label == line) & (frame.side == side)]
+    for frame in frames:
+        for line, edge in set(zip(frame.points.label, frame.side)):
+            own = frame.points.pixels[(frame.points.label == line) & (frame.side == edge)]
             step = np.linalg.norm(np.diff(own, axis=0), axis=1)
             # Evenly spread over the floor they would differ by a factor of up to seven.
             assert step.max() < 1.6 * step.min()
