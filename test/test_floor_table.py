@@ -139,6 +139,21 @@ def test_pixels_outside_the_image_see_no_floor(table: FloorTable, rig: Rig) -> N
     assert not table.sees_floor(outside).any()
 
 
+def test_the_floor_is_seen_where_the_nearest_pixel_of_the_region_says(
+    table: FloorTable, rig: Rig,
+) -> None:
+    rng = np.random.default_rng(2)
+    size = np.array([rig.camera.width, rig.camera.height])
+    pixels = rng.uniform(-10.0, size + 10.0, (4000, 2))
+    expected = []
+    for u, v in pixels:
+        column, row = round(u), round(v)
+        inside = 0 <= column < size[0] and 0 <= row < size[1]
+        expected.append(inside and table.region[row, column] > 0)
+    assert 100 < sum(expected) < 3900
+    np.testing.assert_array_equal(table.sees_floor(pixels), expected)
+
+
 def test_a_mirror_under_the_floor_is_refused() -> None:
     rig = arena_rig()
     sunk = replace(rig, T_base_mirror=RigidTransform(

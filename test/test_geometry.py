@@ -30,6 +30,7 @@ from nccs_pose.geometry import (
     RigidTransform,
     wrap_angle,
 )
+from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import rotation_exp
 from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
 import numpy as np
@@ -294,3 +295,26 @@ def test_a_scaled_camera_sees_the_same_directions() -> None:
     corner = np.array([[-0.5, -0.5]])
     np.testing.assert_allclose(camera.directions(corner), half.directions(corner), atol=1e-12)
     assert (half.width, half.height) == (600, 400)
+
+
+@given(poses, poses)
+def test_the_difference_of_poses_is_that_of_numbers_with_the_angle_wrapped(
+    a: Pose2, b: Pose2,
+) -> None:
+    difference = a.minus(b)
+    np.testing.assert_allclose(difference[:2], [a.x - b.x, a.y - b.y], atol=1e-12)
+    turn = Rotation.from_euler('z', a.yaw) * Rotation.from_euler('z', b.yaw).inv()
+    # As angles, not as numbers: half a turn is both -pi and pi.
+    assert abs(np.exp(1j * difference[2]) - np.exp(1j * turn.as_rotvec()[2])) < 1e-9
+    assert abs(difference[2]) <= np.pi
+
+
+def test_a_definite_system_is_solved_and_another_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((4, 4))
+    matrix, right = root @ root.T, rng.standard_normal((4, 3))
+    np.testing.assert_allclose(matrix @ definite_solution(matrix, right), right, atol=1e-10)
+    np.testing.assert_allclose(
+        matrix @ definite_solution(matrix, right[:, 0]), right[:, 0], atol=1e-10)
+    with pytest.raises(np.linalg.LinAlgError):
+        definite_solution(np.diag([1.0, -1.0]), np.ones(2))

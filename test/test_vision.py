@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import groupby
 
 import cv2
 from hypothesis import given
@@ -27,7 +28,7 @@ from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
-from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import CONTRASTS, LineColour
 from nccs_pose.vision.profile_search import search_profiles
 from nccs_pose.vision.profiles import fit_profiles
@@ -467,3 +468,11 @@ def test_tapes_of_a_furnished_room_are_in_the_mask() -> None:
     assert len(wide) > 60
     u, v = np.rint(wide.centre).astype(int).T
     assert (cv2.dilate(mask, np.ones((3, 3), np.uint8))[v, u] > 0).mean() > 0.9
+
+
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=40))
+def test_runs_are_those_that_itertools_finds(numbers: list[int]) -> None:
+    first, count = runs(np.array(numbers))
+    expected = [(number, len(list(members))) for number, members in groupby(numbers)]
+    assert [(numbers[at], n) for at, n in zip(first.tolist(), count.tolist())] == expected
+    assert (first == np.cumsum(count) - count).all()

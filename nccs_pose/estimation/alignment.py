@@ -77,6 +77,8 @@ class Alignment:
     :ivar covariance: of (x, y, yaw) (3, 3).
     :ivar refinement: the last solve.
     :ivar points: the pixels it rests on, labelled by map line.
+    :ivar residual: of the points, whitened (N,).
+    :ivar noise: of the image, by which they are whitened (N,), px.
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
     :ivar missing: map lines that should be seen plainly and are not there.
@@ -90,6 +92,8 @@ class Alignment:
     covariance: Array
     refinement: Refinement
     points: LinePoints
+    residual: Array
+    noise: Array
     explained: float
     lines: tuple[int, ...]
     missing: tuple[int, ...]
@@ -268,16 +272,15 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     worth = bands.spacing * np.minimum(1.0, bands.half_width)
     residual = refinement.residual[refinement.inlier]
     sigma, label = fit.sigma.take(index), bands.label.take(index)
-    scale = root_mean_square(residual)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, _ = runs(group)
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
-    correlation, misfit = common_errors(
-        pooled(residual, group), together, label[first])
+    correlation, misfit = common_errors(pooled(residual, group), together, label[first])
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, correlation * refinement.covariance, refinement,
-        LinePoints(pixels, scale * sigma, label), float(worth.take(index).sum() / worth.sum()),
+        LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
+        float(worth.take(index).sum() / worth.sum()),
         tuple(np.flatnonzero(there).tolist()), _missing(bands, index),
         np.where(seen > 0, there / np.maximum(seen, 1), np.nan), misfit, measured.colours)
 

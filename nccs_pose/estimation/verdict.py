@@ -107,8 +107,8 @@ def is_weak(alignment: Alignment) -> bool:
 
 def _misfits(alignment: Alignment) -> tuple[float, float]:
     """Root mean square residual, as a multiple of the noise of the image and in px."""
-    residual, told = _residuals(alignment)
-    return root_mean_square(residual), root_mean_square(residual * told)
+    return (root_mean_square(alignment.residual),
+            root_mean_square(alignment.residual * alignment.noise))
 
 
 def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
@@ -118,20 +118,13 @@ def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     pass for noise.
     """
     label = alignment.points.label
-    residual, told = _residuals(alignment)
-    offset, weight = residual * told, 1.0 / told**2
+    offset = alignment.residual * alignment.noise
+    weight = 1.0 / np.square(alignment.noise)
     total = np.maximum(np.bincount(label, weight, minlength=lines), 1e-12)
     mean = np.bincount(label, weight * offset, minlength=lines) / total
     scatter = np.bincount(label, weight * np.square(offset - mean[label]), minlength=lines)
     count = np.maximum(np.bincount(label, minlength=lines) - 1, 1)
     return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)
-
-
-def _residuals(alignment: Alignment) -> tuple[Array, Array]:
-    """Residuals of the inliers, whitened (N,), and the noise that they were whitened by, px."""
-    residual = alignment.refinement.residual[alignment.refinement.inlier]
-    # The points' sigma is as it turned out.
-    return residual, alignment.points.sigma / max(root_mean_square(residual), 1e-9)
 
 
 def _name(line_map: LineMap, k: int) -> str:

@@ -60,5 +60,5 @@ def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     edge = np.empty(len(number) + 1, dtype=bool)
     edge[0] = edge[-1] = True
     np.not_equal(number[1:], number[:-1], out=edge[1:-1])
-    at = np.flatnonzero(edge)
+    at = edge.nonzero()[0]
     return at[:-1], at[1:] - at[:-1]

@@ -52,6 +52,7 @@ _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
 # Stations over so many px share what they know of the floor, the contrast and the noise.
 _SHARED_PX = 16.0
+_SIDES = np.array([1.0, -1.0], np.float32)[:, None, None]
 # At most so many pixels of a station are looked for along and across.
 _MOST_ALONG, _MOST_ACROSS = 40, 31
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
@@ -156,7 +157,7 @@ def _products(
     n, count = s.shape
     floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
     wide = (half_width / blur).astype(np.float32)[:, None]
-    edges = s * np.float32(1.0 / blur) + np.stack([wide, -wide])
+    edges = s * np.float32(1.0 / blur) + _SIDES * wide
     square = np.square(edges)
     # tanh of a cubic is the normal distribution to 0.0003, at a tenth of the cost.
     rise = square * np.float32(0.0356774)
@@ -220,7 +221,7 @@ def fit_profiles(
     margin = _MARGIN_PX + _MARGIN_BLURS * blur
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
-    rows = max(min(round(density * float(bands.spacing.mean())), _MOST_ALONG), 1)
+    rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
     pixels, s = _read_pixels(image, bands, margin, rows)
     groups, count = _Groups.of(bands), s.shape[1]
     pooled, by_shift, floor = _products(pixels, s, bands.half_width, blur, groups.first)
