@@ -170,8 +170,9 @@ def _carried(
     pose: Pose2, covariance: Array, step: Pose2, sigma: float, sigma_yaw: float,
 ) -> Array:
     """Covariance (3, 3) after a step: an error in yaw swings the step sideways."""
-    swing = pose.rotation @ step.translation
-    jacobian = np.eye(3)
-    jacobian[0, 2], jacobian[1, 2] = -swing[1], swing[0]
-    noise = np.diag([sigma**2, sigma**2, sigma_yaw**2])
-    return jacobian @ covariance @ jacobian.T + noise
+    moved = pose @ step
+    jacobian = np.array([
+        [1.0, 0.0, pose.y - moved.y], [0.0, 1.0, moved.x - pose.x], [0.0, 0.0, 1.0]])
+    carried = jacobian @ covariance @ jacobian.T
+    carried.flat[::4] += sigma**2, sigma**2, sigma_yaw**2
+    return carried

@@ -152,9 +152,8 @@ class BandPredictor:
         reach = half * np.abs(lean)
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
                 & (distance < self._length.take(number) - reach))
-        bands = Bands(centre, as_points(image.pixels), as_points(across),
-                      as_points(-1j * across), bend, half_width, places.spacing,
-                      self._lines.take(number))
+        bands = Bands(centre, as_points(image.pixels), as_points(across), bend, half_width,
+                      places.spacing, self._lines.take(number))
         slide = self._slide(rotation, middle, image, across)
         if keep.all():
             return bands, slide

@@ -30,7 +30,6 @@ class Bands:
     :ivar centre: middle between the tape's two predicted edges (N, 2), px.
     :ivar midline: predicted image of the tape's midline (N, 2), px; it is not the middle.
     :ivar across: unit normal of the curve (N, 2), towards the tape's left edge.
-    :ivar along: unit tangent (N, 2).
     :ivar bend: curvature of the curve towards ``across`` (N,), 1/px.
     :ivar half_width: half of the tape's width along ``across`` (N,), px.
     :ivar spacing: length of curve that the station stands for (N,), px.
@@ -40,7 +39,6 @@ class Bands:
     centre: Array
     midline: Array
     across: Array
-    along: Array
     bend: Array
     half_width: Array
     spacing: Array
@@ -51,8 +49,8 @@ class Bands:
 
     def __getitem__(self, index: NDArray[np.bool_]) -> Bands:
         return Bands(
-            self.centre[index], self.midline[index], self.across[index], self.along[index],
-            self.bend[index], self.half_width[index], self.spacing[index], self.label[index])
+            self.centre[index], self.midline[index], self.across[index], self.bend[index],
+            self.half_width[index], self.spacing[index], self.label[index])
 
 
 def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
