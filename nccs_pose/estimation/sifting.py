@@ -152,7 +152,7 @@ class Sifter:
         """
         alignment = found.alignment
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        if sharp or explains_nearly_all(found):
+        if sharp:
             return False
         least = self._options.ambiguity_ratio * found.by_strips
         return any(c.score >= least and not same_pose(c.pose, alignment.pose)
