@@ -41,6 +41,8 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.6
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
+# So does a pose that explains more than this of what should be seen and of what is.
+_PLAINLY_ALL = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,7 @@ class Sifter:
         """
         alignment = found.alignment
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        if sharp:
+        if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
             return False
         least = self._options.ambiguity_ratio * found.by_strips
         return any(c.score >= least and not same_pose(c.pose, alignment.pose)
