@@ -315,7 +315,9 @@ def _segments(
     if hide is not None:
         image[:, hide] = 205
     mask = chromatic_mask(image, 'green', 4.5, 0.05, 31)
-    return floor_segments(find_blobs(mask & table.region, 400), table, WIDTH, 'green')
+    return floor_segments(
+        find_blobs(mask & table.region, 400), table, WIDTH, 'green',
+        longest=max(line.length for line in line_map))
 
 
 def _lies_on(strip: FloorSegment, line: Line, pose: Pose2) -> float:
@@ -369,6 +371,14 @@ def test_a_tape_cut_in_pieces_is_joined(table: FloorTable) -> None:
     on = [s for s in strips if _lies_on(s, whole[0], HERE) < 0.04]
     assert len(on) == 1
     assert np.linalg.norm(on[0].end - on[0].start) == pytest.approx(2.4, abs=0.12)
+
+
+def test_tapes_in_a_row_are_not_taken_for_one(table: FloorTable) -> None:
+    row = LineMap(tuple(_line((x, 0.9), (x + 0.8, 0.9)) for x in (-1.4, -0.4, 0.6)))
+    strips = _segments(row, HERE, table)
+    assert len(strips) == 3
+    ends = sorted(sorted(HERE.apply(np.array([s.start, s.end]))[:, 0]) for s in strips)
+    np.testing.assert_allclose(ends, [[-1.4, -0.6], [-0.4, 0.4], [0.6, 1.4]], atol=0.06)
 
 
 def _sheet(x: float, y: float, width: float, length: float, angle: float = 0.3) -> Line:

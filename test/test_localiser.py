@@ -177,6 +177,19 @@ def test_a_symmetric_map_lists_all_its_poses_until_a_prior_decides(line_map: Lin
         assert _near(later.pose, turns[1] @ drive.pose)
 
 
+def test_a_map_of_tapes_in_rows_is_understood() -> None:
+    """Here a strip with gaps in it is several lines, not one that something hides in part."""
+    rows = LineMap((
+        _line((-1.8, -1.2), (-0.9, -1.2)), _line((0.6, -1.2), (-0.6, -1.2)),
+        _line((0.9, -1.2), (1.8, -1.2)), _line((1.9, -1.0), (1.7, 0.1)),
+        _line((1.65, 0.4), (1.5, 1.2)), _line((-1.2, 1.3), (0.4, 1.2))))
+    drive = Drive(replace(SCENE, line_map=rows), Pose2(0.2, -0.1, 0.7))
+    first = drive.go()
+    assert first.state is State.TRACKING
+    assert drive.right(first)
+    assert first.quality.lines_used == len(rows)
+
+
 def test_driving_on_decides_between_equal_poses() -> None:
     """A hall whose two ends look the same, but for a stripe that is out of sight at first."""
     hall = LineMap((

@@ -22,6 +22,7 @@ signs), splits a blob over two crossing tapes, and joins a tape that something c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 from nccs_pose.estimation.floor_points import fit_line, FloorPoints, principal_lines, squares
 from nccs_pose.geometry.floor_table import FloorTable
@@ -37,6 +38,9 @@ _LEAST_SAMPLES = 8
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
+# So much longer than the longest tape they are several in a row, this far apart, metres.
+_TOO_LONG = 1.1
+_ROW_GAP = 0.12
 # Something this close beside a strip, metres, makes it part of a larger thing.
 _BESIDE = 0.15
 # So much beside a strip, of what lies in it, is no crossing tape any more.
@@ -85,10 +89,12 @@ class FloorSegment:
 
 def floor_segments(
     segmentation: Segmentation, table: FloorTable, width: float, colour: str, most: int = 16,
+    longest: float = math.inf,
 ) -> tuple[FloorSegment, ...]:
     """Straight strips among the blobs, those of most pixels first.
 
     :param width: width of the tapes, metres.
+    :param longest: length of the longest of them, metres.
     :param colour: their colour class.
     :param most: at most so many.
     """
@@ -124,6 +130,7 @@ def floor_segments(
         futile.clear()
         normal, offset, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
+            inside = _one_tape(points, inside, normal, longest)
             segments.append(
                 _segment(points, segmentation, pixels, inside, normal, offset, colour))
             taken = inside
@@ -239,6 +246,21 @@ def _strip(
     own[points.blob[inside]] = True
     beside = np.flatnonzero((beyond > 0.0) & (beyond < _BESIDE) & (along > low) & (along < high))
     return normal, offset, inside, beside[own[points.blob[beside]]]
+
+
+def _one_tape(
+    points: FloorPoints, inside: NDArray[np.intp], normal: Array, longest: float,
+) -> NDArray[np.intp]:
+    """Of a strip that is longer than any tape the heaviest part between two gaps."""
+    direction = np.array([-normal[1], normal[0]])
+    order = inside[np.argsort(points.floor[inside] @ direction, kind='stable')]
+    along = points.floor[order] @ direction
+    gaps = np.flatnonzero(np.diff(along) > _ROW_GAP) + 1
+    if along[-1] - along[0] <= _TOO_LONG * longest or len(gaps) == 0:
+        return inside
+    bounds = np.concatenate([[0], gaps])
+    heaviest = int(np.add.reduceat(points.weight[order], bounds).argmax())
+    return np.sort(np.split(order, gaps)[heaviest])
 
 
 def _longest_run(

@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import permutations
+import math
 
 from nccs_pose.estimation.association import FittedCandidate, global_candidates, score_pose
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
@@ -38,6 +40,10 @@ _PIXELS_PER_BLOB = 400
 _WIDTH = 320
 _LEAST_WINDOW = 5
 
+# Tapes in a row are parallel to so much, rad, and end this close before another one, metres.
+_STRAIGHT = 0.1
+_APART = 1.0
+
 Strips = tuple[FloorSegment, ...]
 Colours = tuple[LineColour, ...]
 Look = Callable[[NDArray[np.uint8], Strips, Colours], tuple[Strips, Colours]]
@@ -58,6 +64,8 @@ class Searcher:
         self._widths: dict[str, float] = {}
         for line in line_map:
             self._widths[line.colour] = max(line.width, self._widths.get(line.colour, 0.0))
+        # Where no tapes stand in a row, pieces in a row are one tape.
+        self._longest = float(line_map.lengths.max()) if _in_a_row(line_map) else math.inf
         # The paper's threshold is one of whole pixels.
         by_hsv, pitch = options.threshold == 'hsv', 1
         while not by_hsv and table.rig.camera.width >= 2 * pitch * _WIDTH:
@@ -127,7 +135,8 @@ class Searcher:
         found: list[FloorSegment] = []
         for colour, mask in masks.items():
             found.extend(floor_segments(
-                view.blobs(mask, _PIXELS_PER_BLOB), self._table, self._widths[colour], colour))
+                view.blobs(mask, _PIXELS_PER_BLOB), self._table, self._widths[colour], colour,
+                longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
     def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:
@@ -137,3 +146,17 @@ class Searcher:
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""
         return score_pose(pose, segments, self._map, self._table)
+
+
+def _in_a_row(line_map: LineMap) -> bool:
+    """Whether one line of a map goes on, after a gap, as another."""
+    for a, b in permutations(line_map, 2):
+        if float(np.linalg.norm(np.cross(a.direction, b.direction))) > _STRAIGHT:
+            continue
+        for end, outward in ((a.start, -a.direction), (a.end, a.direction)):
+            for other in (b.start, b.end):
+                gap = float((other - end) @ outward)
+                aside = float(np.linalg.norm(other - end - gap * outward))
+                if 0.0 < gap < _APART and aside < _STRAIGHT * _APART:
+                    return True
+    return False
