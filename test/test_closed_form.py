@@ -29,7 +29,9 @@ from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.pose_monomials import gram, monomial_rows, monomials, monomials_jacobian
 from nccs_pose.estimation.refine import refine
 from nccs_pose.estimation.residual import side
-from nccs_pose.estimation.small_matrices import (
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.geometry.rig import Rays
+from nccs_pose.geometry.small_matrices import (
     inverse,
     inverse_2x2,
     inverse_3x3,
@@ -37,8 +39,6 @@ from nccs_pose.estimation.small_matrices import (
     solve_3x3,
     solved,
 )
-from nccs_pose.geometry.pose import Pose2
-from nccs_pose.geometry.rig import Rays
 from nccs_pose.simulation.table_one import TABLE_ONE
 import numpy as np
 import pytest

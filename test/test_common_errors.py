@@ -75,5 +75,7 @@ def test_larger_errors_than_the_pixels_make_are_taken_for_patterns() -> None:
 def test_a_line_of_one_or_two_residuals_is_no_obstacle() -> None:
     label = np.array([0, 1, 1, 2, 2, 2])
     factor, misfit = common_errors(np.full(6, 0.5), np.full(6, 0.1), label)
-    assert factor >= 1.0
+    # By hand: the halves of the two longer lines give 5 over what independent errors would, in one
+    # degree of freedom, beside five times the 1 that such small errors let expect.
+    assert factor == pytest.approx((5.0 + 5.0) / (5.0 + 1.0))
     assert misfit == 0.0

@@ -30,8 +30,8 @@ from nccs_pose.geometry import (
     RigidTransform,
     wrap_angle,
 )
-from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import rotation_exp
+from nccs_pose.geometry.small_matrices import definite_solution
 from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
 import numpy as np
 import pytest

@@ -23,10 +23,10 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.shift_solve import pooled, solve_shifts
-from nccs_pose.estimation.small_matrices import solution
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import solution
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
@@ -193,7 +193,7 @@ class Aligner:
             fit, learned = fit_profiles(image, bands, colours[0], rough=rough)
             return fit, (learned,)
         n = len(bands)
-        shift, sigma, contrast = np.zeros(n), np.ones(n), np.zeros(n)
+        shift, sigma = np.zeros(n), np.ones(n)
         found, group = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.intp)
         learned_all = list(colours)
         for k, colour in enumerate(colours):
@@ -201,9 +201,9 @@ class Aligner:
             if own.any():
                 fit, learned_all[k] = fit_profiles(
                     image, bands[own], colour, rough=rough)
-                shift[own], sigma[own], contrast[own] = fit.shift, fit.sigma, fit.contrast
+                shift[own], sigma[own] = fit.shift, fit.sigma
                 found[own], group[own] = fit.found, k * n + fit.group
-        return ProfileFit(shift, sigma, contrast, found, group), tuple(learned_all)
+        return ProfileFit(shift, sigma, found, group), tuple(learned_all)
 
     def _search(
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],

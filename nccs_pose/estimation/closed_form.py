@@ -31,8 +31,8 @@ from __future__ import annotations
 import math
 
 from nccs_pose.estimation.pose_monomials import Minimum
-from nccs_pose.estimation.small_matrices import inverse_2x2, ROUNDING
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import inverse_2x2, ROUNDING
 
 
 def horizontal_minima(gram: Array) -> tuple[Minimum, ...]:

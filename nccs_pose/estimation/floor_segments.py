@@ -233,7 +233,8 @@ def _strip(
         direction = np.array([-normal[1], normal[0]])
         along = points.floor @ direction
         before = inside
-        inside = _longest_run(points, along, np.flatnonzero(free & (beyond < 0.0)))
+        inside = _longest_run(
+            points, along, np.flatnonzero(free & (beyond < 0.0)), _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
         if np.array_equal(inside, before):
@@ -252,19 +253,14 @@ def _one_tape(
     points: FloorPoints, inside: NDArray[np.intp], normal: Array, longest: float,
 ) -> NDArray[np.intp]:
     """Of a strip that is longer than any tape the heaviest part between two gaps."""
-    direction = np.array([-normal[1], normal[0]])
-    order = inside[np.argsort(points.floor[inside] @ direction, kind='stable')]
-    along = points.floor[order] @ direction
-    gaps = np.flatnonzero(np.diff(along) > _ROW_GAP) + 1
-    if along[-1] - along[0] <= _TOO_LONG * longest or len(gaps) == 0:
+    along = points.floor @ np.array([-normal[1], normal[0]])
+    if np.ptp(along[inside]) <= _TOO_LONG * longest:
         return inside
-    bounds = np.concatenate([[0], gaps])
-    heaviest = int(np.add.reduceat(points.weight[order], bounds).argmax())
-    return np.sort(np.split(order, gaps)[heaviest])
+    return _longest_run(points, along, inside, _ROW_GAP)
 
 
 def _longest_run(
-    points: FloorPoints, along: Array, inside: NDArray[np.intp],
+    points: FloorPoints, along: Array, inside: NDArray[np.intp], longest_gap: float,
 ) -> NDArray[np.intp]:
     """Of a strip's points those of its heaviest part without a long gap.
 
@@ -273,7 +269,7 @@ def _longest_run(
     if len(inside) == 0:
         return inside
     order = inside[np.argsort(along[inside], kind='stable')]
-    gaps = np.flatnonzero(np.diff(along[order]) > _LONGEST_GAP) + 1
+    gaps = np.flatnonzero(np.diff(along[order]) > longest_gap) + 1
     if len(gaps) == 0:
         return inside
     bounds = np.concatenate([[0], gaps])

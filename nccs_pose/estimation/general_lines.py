@@ -32,8 +32,8 @@ import math
 
 from nccs_pose.estimation.closed_form import horizontal_minima, vertical_minima
 from nccs_pose.estimation.pose_monomials import Minimum, monomials_and_slopes
-from nccs_pose.estimation.small_matrices import inverse_2x2, ROUNDING
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import inverse_2x2, ROUNDING
 import numpy as np
 from numpy.typing import NDArray
 

@@ -48,8 +48,8 @@ from nccs_pose.estimation.general_lines import (
     YAWS,
 )
 from nccs_pose.estimation.pose_monomials import Minimum
-from nccs_pose.estimation.small_matrices import ROUNDING
 from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.small_matrices import ROUNDING
 import numpy as np
 
 _FINE_COUNT = 64

@@ -37,9 +37,9 @@ from nccs_pose.estimation.observability import (
     unobserved_directions,
 )
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
-from nccs_pose.estimation.small_matrices import inverse, inverse_3x3, solved
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
+from nccs_pose.geometry.small_matrices import inverse, inverse_3x3, solved
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -222,8 +222,7 @@ def _polished(data: LabelledRays, weights: Array, pose: Pose2) -> _Found:
 def _same(a: _Found, b: _Found) -> bool:
     """Whether two poses are one up to the noise, as far as the better of them tells."""
     better = a if a.chi2 < b.chi2 else b
-    step = a.pose.as_array() - b.pose.as_array()
-    step[2] = _difference(a.pose.yaw, b.pose.yaw)
+    step = a.pose.minus(b.pose)
     return bool(step @ better.information @ step < _SAME_POSE**2) and abs(step[2]) < 0.5 * math.pi
 
 

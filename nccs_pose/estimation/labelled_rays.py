@@ -26,9 +26,9 @@ from nccs_pose.estimation.pose_monomials import (
     monomials_jacobian,
     with_derivatives,
 )
-from nccs_pose.estimation.small_matrices import solve_3x3
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
+from nccs_pose.geometry.small_matrices import solve_3x3
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

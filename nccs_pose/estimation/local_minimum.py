@@ -26,8 +26,8 @@ import math
 
 from nccs_pose.estimation.general_lines import all_minima
 from nccs_pose.estimation.pose_monomials import Minimum, monomials_and_slopes
-from nccs_pose.estimation.small_matrices import solve_3x3
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import solve_3x3
 
 # Newton's method is given up further from its start than this (rad), or after so many steps.
 _ASTRAY = 0.1

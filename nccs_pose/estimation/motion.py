@@ -20,8 +20,8 @@ from bisect import bisect_right
 from dataclasses import dataclass
 import math
 
-from nccs_pose.estimation.small_matrices import inverse, inverse_3x3
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.small_matrices import inverse, inverse_3x3
 import numpy as np
 
 # Odometry further from a stamp than this says nothing about it, ns.

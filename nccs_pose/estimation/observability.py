@@ -34,8 +34,8 @@ import math
 
 from nccs_pose.estimation.general_lines import ALIGNED
 from nccs_pose.estimation.pose_monomials import feet_in_plan
-from nccs_pose.estimation.small_matrices import inverse_2x2, solved
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import inverse_2x2, solved
 import numpy as np
 
 # Two lines of a map written by hand are parallel, or meet, when they do so up to this (rad, m).

@@ -23,9 +23,9 @@ from typing import NamedTuple
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.residual import check_rays_and_lines
 from nccs_pose.estimation.side_form import SideForm
-from nccs_pose.estimation.small_matrices import inverse, solution
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
+from nccs_pose.geometry.small_matrices import inverse, solution
 import numpy as np
 from numpy.typing import NDArray
 

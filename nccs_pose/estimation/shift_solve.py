@@ -22,9 +22,8 @@ pose; who predicts again at the pose found makes it exact.
 from __future__ import annotations
 
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.small_matrices import inverse
-from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import definite_solution, inverse
 from nccs_pose.vision.bands import runs
 from nccs_pose.vision.profiles import median
 import numpy as np

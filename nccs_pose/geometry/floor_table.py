@@ -155,7 +155,11 @@ class FloorTable:
             whole, rig.cop, rig.T_base_mirror.inverse().apply(points.reshape(-1, 3)))
         pixels, in_front = rig.camera.project((m - rig.cop) @ rig.R_mirror_camera)
         seen = (visible & in_front).reshape(points.shape[:2])
-        self._falls = self._outward_by_fall(points, m, seen)
+        falls = self._falls_of_rays(points, m, seen)
+        self._falls = falls[..., 0], falls[..., 1]
+        # Outward, past the foot, and as good as the same all round.
+        self._outward = radius[_PADDING + 1:], np.einsum('rai,ai->r', falls[_PADDING + 1:], (
+            np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)))
         if not seen[_PADDING].any():
             raise GeometryError('the rig sees no floor: its nadir is not in the mirror')
         pixels = pixels.reshape(*points.shape[:2], 2)
@@ -171,34 +175,28 @@ class FloorTable:
         padded = np.array(rows)
         return spline_filter(padded[..., 0]), spline_filter(padded[..., 1])
 
-    def _outward_by_fall(
-        self, points: Array, m: Array, seen: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
-        """Distance from the mirror's foot, and how far out a ray goes there for each metre down.
+    def _falls_of_rays(self, points: Array, m: Array, seen: NDArray[np.bool_]) -> Array:
+        """How far rays go over the floor for each metre that they fall (angles, azimuths, 2).
 
-        The ray comes from its own point of the mirror, not from the mirror's origin.
+        A ray comes from its own point of the mirror, not from the mirror's origin. Where none is
+        seen stands that of the angle before.
 
         :param points: on the floor (angles, azimuths, 3), in base_link.
         :param m: their mirror points, in the mirror frame (angles x azimuths, 3).
         :param seen: which are seen (angles, azimuths).
         """
         mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
-        offset = points[..., :2] - self.foot
-        radius = np.linalg.norm(offset, axis=2)
-        outward = np.einsum('rai,rai->ra', points[..., :2] - mirror[..., :2], offset)
-        fall = np.maximum(mirror[..., 2], 1e-6) * np.maximum(radius, 1e-9)
-        self._fall = _filled(
-            (points[..., :2] - mirror[..., :2]) / np.maximum(mirror[..., 2:], 1e-6), seen)
-        rows = [row for row in range(_PADDING + 1, len(points)) if seen[row].any()]
-        return radius[rows, 0], np.array(
-            [float(np.mean((outward[row] / fall[row])[seen[row]])) for row in rows])
+        falls = (points[..., :2] - mirror[..., :2]) / np.maximum(mirror[..., 2:], 1e-6)
+        for row in range(1, len(falls)):
+            falls[row, ~seen[row]] = falls[row - 1, ~seen[row]]
+        return falls
 
     def falls(self, radius: Array) -> Array:
         """How far outward over the floor a ray goes for each metre that it falls (N,).
 
         :param radius: where it meets the floor, from the mirror's foot (N,), metres.
         """
-        return np.interp(radius, *self._falls)
+        return np.interp(radius, *self._outward)
 
     def met(self, points: Array, rise: Array) -> Array:
         """Where rays that see points over the floor meet it (N, 2), in base_link.
@@ -209,19 +207,12 @@ class FloorTable:
         met = points
         # The rays a little further on are almost parallel: twice is enough.
         for _ in range(2):
-            at = self._at(met - self.foot)
+            offset = met - self.foot
+            at = self._places(offset, np.hypot(offset[:, 0], offset[:, 1]))
             fall = np.stack([map_coordinates(component, at, order=1, mode='nearest')
-                             for component in self._fall], axis=1)
+                             for component in self._falls], axis=1)
             met = points + rise[:, None] * fall
         return met
-
-    def _at(self, offset: Array) -> Array:
-        """Place in the grid (2, N) of floor points (N, 2) off the mirror's foot."""
-        angle = np.arctan2(np.hypot(offset[:, 0], offset[:, 1]), self.height)
-        azimuth = np.arctan2(offset[:, 1], offset[:, 0]) % (2.0 * np.pi)
-        return np.stack([
-            angle * (_ANGLES / self._last_angle) + _PADDING,
-            azimuth * (_AZIMUTHS / (2.0 * np.pi)) + _PADDING])
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
@@ -238,6 +229,13 @@ class FloorTable:
         :param radius: its length (N,).
         :returns: the places, 0 to 1, and the coefficients around them (N, 16, 2), by angles first.
         """
+        at = self._places(offset, radius)
+        cell = at.astype(np.intp)
+        first = cell[0] * self._columns + cell[1]
+        return at - cell, self._knots.take(first[:, None] + self._taps, axis=0)
+
+    def _places(self, offset: Array, radius: Array) -> Array:
+        """Places in the grid by angle and azimuth (2, N) of floor points; see :meth:`_cells`."""
         at = np.empty((2, len(offset)))
         np.multiply(np.arctan2(radius, self.height), _ANGLES / self._last_angle, out=at[0])
         np.multiply(np.arctan2(offset[:, 1], offset[:, 0]), _AZIMUTHS / (2.0 * np.pi), out=at[1])
@@ -245,9 +243,7 @@ class FloorTable:
         at[1] += _AZIMUTHS * (at[1] < 0.0)
         at += _PADDING
         np.minimum(at[0], self._last_row, out=at[0])
-        cell = at.astype(np.intp)
-        first = cell[0] * self._columns + cell[1]
-        return at - cell, self._knots.take(first[:, None] + self._taps, axis=0)
+        return at
 
     def expand(self, points: Array) -> FloorExpansion:
         """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
@@ -325,11 +321,3 @@ class FloorTable:
         start, rise = p00 + a * low, p01 - p00 + a * (high - low)
         by_u = (low + b * (high - low)) / _STRIDE
         return start + b * rise, np.stack([by_u, rise / _STRIDE], axis=2)
-
-
-def _filled(grid: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Both components of a grid (R, A, 2), unseen places taking over those of the row before."""
-    grid = grid.copy()
-    for row in range(1, len(grid)):
-        grid[row, ~seen[row]] = grid[row - 1, ~seen[row]]
-    return grid[..., 0], grid[..., 1]

@@ -21,8 +21,8 @@ from functools import cached_property
 import math
 
 from nccs_pose.errors import VisionError
-from nccs_pose.geometry.definite import definite_solution
 from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.small_matrices import definite_solution
 import numpy as np
 
 # Signs of the contrast (tape minus floor) in B, G, R of each class that a map may name.

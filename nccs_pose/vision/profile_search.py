@@ -20,7 +20,8 @@ import cv2
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.profiles import as_complex, FOUND, FOUND_FRACTION, ProfileFit
+from nccs_pose.vision.profile_products import as_complex
+from nccs_pose.vision.profiles import FOUND, FOUND_FRACTION, ProfileFit
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -45,7 +46,7 @@ def search_profiles(
     # From station to station the tape stays and the noise does not.
     noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
     return ProfileFit(
-        offsets[best], np.full(len(bands), 1.0), height.astype(float),
+        offsets[best], np.full(len(bands), 1.0),
         height > max(FOUND * noise, FOUND_FRACTION), rows)
 
 

@@ -20,22 +20,18 @@ the two predicted edges. One fit serves tapes of ten pixels, whose edges are res
 half a pixel, of which only the coverage is seen. What is measured is the shift delta of both
 edges from where the pose says; at the true pose it is zero for each, so that no middle of a
 blob has to be believed.
-
-The image is read at its own pixels, each with its exact place s across the curve: reading between
-pixels would blur them and correlate their noise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 import math
 from typing import NamedTuple
 
-import cv2
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.profile_products import profile_products, read_pixels
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,9 +48,8 @@ _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
 # Stations over so many px share what they know of the floor, the contrast and the noise.
 _SHARED_PX = 16.0
-_SIDES = np.array([1.0, -1.0], np.float32)[:, None, None]
-# At most so many pixels of a station are looked for along and across.
-_MOST_ALONG, _MOST_ACROSS = 40, 31
+# At most so many rows of a station are looked for.
+_MOST_ALONG = 40
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
 _CONTRAST_SPREAD = 0.2
 # Residuals this much above the usual are no chance any more.
@@ -76,112 +71,14 @@ class ProfileFit:
 
     :ivar shift: delta (N,), px along ``across``.
     :ivar sigma: its standard deviation (N,), px.
-    :ivar contrast: height of the profile over that of its line (N,); 1 is as expected.
     :ivar found: whether a tape is there at all (N,).
     :ivar group: number of the stretch of line (N,) whose floor, contrast and noise it shares.
     """
 
     shift: Array
     sigma: Array
-    contrast: Array
     found: NDArray[np.bool_]
     group: NDArray[np.intp]
-
-
-def _read_pixels(
-    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The pixels nearest to a grid over each band: values (N, P, 3) and place across s (N, P), px.
-
-    :param margin: beyond the edges, px.
-    :param rows: of the grid along each station's piece of curve.
-    """
-    # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
-    # across for its real part and the one along (backwards) for its imaginary part.
-    centre = as_complex(bands.centre)
-    across = as_complex(bands.across)[:, None]
-    bend = (0.5 * bands.bend).astype(np.float32)[:, None]
-    half_band = (bands.half_width + margin).astype(np.float32)
-    k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    t = bands.spacing.astype(np.float32)[:, None] * _middles(rows)
-    # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
-    on_curve = (bend * t * t - 1j * t) * across
-    arm = (half_band[:, None] * _between(k)) * across
-    at = (on_curve + centre[:, None])[:, :, None] + arm[:, None, :]
-    pixels = at.view(np.float32)
-    np.rint(pixels, out=pixels)
-    n = len(bands)
-    values = cv2.remap(image, pixels.reshape(n, rows * k, 2), None, cv2.INTER_NEAREST,
-                       borderMode=cv2.BORDER_REPLICATE)
-    at = at.reshape(n, rows * k)
-    at -= centre[:, None]
-    at *= across.conj()
-    s = np.square(at.imag)
-    s *= bend
-    return values, np.subtract(at.real, s, out=s)
-
-
-@cache
-def _middles(count: int) -> NDArray[np.float32]:
-    """The middles of so many equal parts of what reaches from -1/2 to 1/2."""
-    return ((np.arange(count) + 0.5) / count - 0.5).astype(np.float32)
-
-
-@cache
-def _between(count: int) -> NDArray[np.float32]:
-    """So many places from -1 to 1."""
-    return np.linspace(-1.0, 1.0, count, dtype=np.float32)
-
-
-def as_complex(points: Array) -> NDArray[np.complex64]:
-    """Points (N, 2) of the image as complex numbers u + iv (N,)."""
-    return np.ascontiguousarray(points, dtype=np.float32).view(np.complex64)[:, 0]
-
-
-def _products(
-    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, blur: float,
-    first: NDArray[np.intp],
-) -> tuple[Array, Array, Array]:
-    """What stations and groups say, in the products of templates and image with each other.
-
-    With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
-    is the profile, D = dT/d(delta) and B = dT/d(blur).
-
-    :param pixels: (N, P, 3) BGR.
-    :param s: their place across the curve (N, P), px.
-    :param first: station of each group (G,).
-    :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (G, 7, 8); those with D of each station (N, 8); and the floor's colour
-        (3,), which the channels are less.
-    """
-    n, count = s.shape
-    floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
-    wide = (half_width / blur).astype(np.float32)[:, None]
-    edges = s * np.float32(1.0 / blur) + _SIDES * wide
-    square = np.square(edges)
-    # tanh of a cubic is the normal distribution to 0.0003, at a tenth of the cost.
-    rise = square * np.float32(0.0356774)
-    rise += np.float32(0.7978846)
-    rise *= edges
-    np.tanh(rise, out=rise)
-    square *= np.float32(-0.5)
-    steep = np.exp(square, out=square)
-    edges *= steep
-    rows = np.empty((8, n, count), np.float32)
-    np.subtract(rise[0], rise[1], out=rows[0])
-    np.subtract(steep[1], steep[0], out=rows[1])
-    rows[2] = s
-    np.subtract(edges[1], edges[0], out=rows[3])
-    # Numbers about zero keep their digits in sums of squares.
-    for k, channel in enumerate(cv2.split(pixels)):
-        np.subtract(channel, floor[k], out=rows[4 + k])
-    rows[7] = 1.0
-    # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
-    products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
-    steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
-    scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    return (np.add.reduceat(products, first, axis=0) * (scale[:7, None] * scale),
-            products[:, 1] * (steepness * scale), floor)
 
 
 class _Groups(NamedTuple):
@@ -222,9 +119,9 @@ def fit_profiles(
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
-    pixels, s = _read_pixels(image, bands, margin, rows)
+    pixels, s = read_pixels(image, bands, margin, rows)
     groups, count = _Groups.of(bands), s.shape[1]
-    pooled, by_shift, floor = _products(pixels, s, bands.half_width, blur, groups.first)
+    pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, groups.first)
     size = count * groups.members
     means = pooled[:, :, 7] / size[:, None]
     centred = pooled[:, :, :7] - means[:, :, None] * pooled[:, None, :, 7]
@@ -248,7 +145,7 @@ def fit_profiles(
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
     return ProfileFit(
-        gain * fit.shift, gain * fit.sigma, fit.contrast, fit.found, fit.group), colour
+        gain * fit.shift, gain * fit.sigma, fit.found, fit.group), colour
 
 
 class _System(NamedTuple):
@@ -340,7 +237,7 @@ def _shifts(
     part = own_power / np.add.reduceat(own_power, groups.first)[of]
     sigma = np.sqrt(variance[of] / (part * shift_power[of])) / smooth[of]
     return ProfileFit(
-        own / own_power / smooth[of], sigma, (a / level)[of], found[of], of), moved / smooth
+        own / own_power / smooth[of], sigma, found[of], of), moved / smooth
 
 
 def median(values: Array) -> float:

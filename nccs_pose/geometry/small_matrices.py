@@ -13,12 +13,16 @@
 # limitations under the License.
 
 
-"""Symmetric matrices of two and three rows, number by number: quicker than a call of LAPACK."""
+"""Small symmetric matrices, without numpy's ceremony.
+
+Two and three rows go number by number, quicker than any call; more of them to LAPACK itself.
+"""
 
 from __future__ import annotations
 
 from nccs_pose.geometry.pose import Array
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 # Relative size below which a pivot of a Gram matrix is nothing but rounding.
 ROUNDING = 1e-12
@@ -82,3 +86,14 @@ def inverse(matrix: Array) -> Array:
     """Inverse of any regular, symmetric matrix."""
     found = inverse_3x3(matrix) if len(matrix) == 3 else None
     return np.asarray(np.linalg.inv(matrix), dtype=float) if found is None else found
+
+
+def definite_solution(matrix: Array, right: Array) -> Array:
+    """Solution (P,) or (P, K) of a system (P, P) by Cholesky's factors.
+
+    :raises numpy.linalg.LinAlgError: where the matrix is not positive definite.
+    """
+    _, found, failed = dposv(matrix, right)
+    if failed:
+        raise np.linalg.LinAlgError('the matrix is not positive definite')
+    return np.asarray(found)
