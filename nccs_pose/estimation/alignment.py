@@ -37,13 +37,13 @@ from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 _SPACING = 2.0
-# Where the image is sharp, so that a tape is felt from nearby only, a first, rough pass takes one
-# station of so many; a search takes so many of each line, this far apart (px) or more.
+# Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
+# first, rough pass takes one station of so many; a search takes so many of each line, this far apart (px) or more.
 _ROUGH = 4
 _SEARCHED = 25
 _SEARCHED_SPACING = 8.0
 # A profile is linear in its shift for about so many pixels.
-_LINEAR_PX = 2.0
+LINEAR_PX = 2.0
 _ITERATIONS = 8
 # The poses have settled when the last step moved no station by more than this share of the blur (a
 # shift so small is measured right to two hundredths), or when it was below half a standard
@@ -137,14 +137,14 @@ class Aligner:
         """Lay a pose on the image from a start near it.
 
         :param image: (H, W, 3) uint8 BGR.
-        :param reach: search bands of this half width first, px; 0 where the start is within two
-            pixels.
+        :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
+            are searched first; 0 is for a start that is most likely right.
         :param prior: carries the directions that the lines in view do not fix.
         :returns: None where too little of what the start predicts is found, or where the poses do
             not settle.
         """
         pose = start
-        if reach > 0.0:
+        if reach > LINEAR_PX:
             searched = self._search(image, start, colours, reach, prior)
             if searched is None:
                 return None
@@ -154,9 +154,11 @@ class Aligner:
             return None
         attitude = np.zeros(3)
         sharp = min(colour.blur for colour in colours) < ROUGH_BLUR
-        if sharp and len(places) >= _ROUGH * _LEAST_STATIONS:
+        if (sharp or 0.0 < reach <= LINEAR_PX) and len(places) >= _ROUGH * _LEAST_STATIONS:
             rough = self._measure(
                 image, places.every(_ROUGH), pose, prior, colours, attitude, rough=True)
+            if rough is None and reach > 0.0:
+                return None
             if rough is not None:
                 pose, attitude = rough.refinement.pose, rough.refinement.attitude
         result: Alignment | None = None
@@ -247,7 +249,7 @@ class Aligner:
         if len(bands) < _LEAST_STATIONS:
             return None
         fit, colours = self._fit(image, bands, colours, rough)
-        used = fit.found & (np.abs(fit.shift) < _LINEAR_PX + 2.0 * fit.sigma)
+        used = fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)
         at = np.flatnonzero(used)
         if len(at) < _LEAST_STATIONS:
             return None

@@ -20,7 +20,7 @@ from collections.abc import Set
 from dataclasses import dataclass
 import math
 
-from nccs_pose.estimation.alignment import Aligner, Alignment
+from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
 from nccs_pose.estimation.association import same_pose
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.hypotheses import Hypothesis
@@ -121,8 +121,7 @@ class Sifter:
                 continue
             if any(same_pose(start.pose, pose) for pose in seen):
                 continue
-            alignment = self._aligner.align(
-                sight.image, start.pose, sight.colours, reach=start.reach)
+            alignment = self._laid(sight, start)
             if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
                 continue
             seen.append(alignment.pose)
@@ -145,6 +144,17 @@ class Sifter:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)
         return sifted
+
+    def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
+        """Lay a pose on the image: from close by, and only where that leaves a line out, or all
+        of them, by searching the surroundings."""
+        if start.misfit < LINEAR_PX:
+            alignment = self._aligner.align(
+                sight.image, start.pose, sight.colours, reach=LINEAR_PX)
+            if alignment is not None and not alignment.missing:
+                return alignment
+        return self._aligner.align(
+            sight.image, start.pose, sight.colours, reach=start.reach)
 
     def _doubtful(self, found: Found, sight: Sight) -> bool:
         """Whether the strips speak as much for another pose, and the image for neither.
