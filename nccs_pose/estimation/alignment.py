@@ -38,7 +38,8 @@ from numpy.typing import NDArray
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 _SPACING = 2.0
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
-# first, rough pass takes one station of so many; a search takes so many of each line, this far apart (px) or more.
+# first, rough pass takes one station of so many; a search takes so many of each line, this far
+# apart (px) or more.
 _ROUGH = 4
 _SEARCHED = 25
 _SEARCHED_SPACING = 8.0

@@ -146,8 +146,7 @@ class Sifter:
         return sifted
 
     def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
-        """Lay a pose on the image: from close by, and only where that leaves a line out, or all
-        of them, by searching the surroundings."""
+        """Lay a pose on the image: by searching its surroundings only where a line is left out."""
         if start.misfit < LINEAR_PX:
             alignment = self._aligner.align(
                 sight.image, start.pose, sight.colours, reach=LINEAR_PX)
