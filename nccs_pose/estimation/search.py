@@ -27,9 +27,17 @@ from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.faint_lines import faint_line_mask
 from nccs_pose.vision.learned_contrast import feature_of, learned_colour
 from nccs_pose.vision.reduced import ReducedView
-from nccs_pose.vision.segment import brightness, chromatic_mask, hsv_mask, Mask, raised_mask
+from nccs_pose.vision.segment import (
+    brightness,
+    chromatic_mask,
+    contrast_of,
+    hsv_mask,
+    Mask,
+    raised_mask,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,72 +79,88 @@ class Searcher:
         while not by_hsv and table.rig.camera.width >= 2 * pitch * _WIDTH:
             pitch *= 2
         self._view = ReducedView.of(table.region, pitch)
-        self._closer = ReducedView.of(table.region, max(pitch // 2, 1))
+        # Things as wide are what a pixel of the view is compared with, px of the view.
+        self._window = max(_LEAST_WINDOW, options.window // pitch)
         self.first: Look = self._first_look
         self.further: tuple[tuple[Look, ...], ...] = () if by_hsv else (
-            (self._look_by_example,), (self._closer_look, self._look_by_example))
+            (self._look_by_example,), (self._look_along, self._look_along_by_example))
 
     def segments(self, image: NDArray[np.uint8]) -> Strips:
         """Straight strips of the map's colours on the floor, the largest first."""
-        return self._look(image, self._view)
+        part = self._view.read(image)
+        return self._strips({colour: self._mask(part, colour) for colour in self._widths})
 
     def _first_look(
         self, image: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         return self.segments(image), colours
 
-    def _closer_look(
+    def _look_along(
         self, image: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
-        # A tape hardly brighter than the pattern of its floor shows in a sharp image, and only
-        # where what is brighter to one side does not count.
-        return self._look(image, self._closer, ridges=True), colours
-
-    def _look(
-        self, image: NDArray[np.uint8], view: ReducedView, *, ridges: bool = False,
-    ) -> Strips:
-        part = view.read(image)
-        masks = {c: self._mask(part, c, view, ridges=ridges) for c in self._widths}
-        return self._strips(masks, view)
-
-    def _mask(
-        self, part: NDArray[np.uint8], colour: str, view: ReducedView, *, ridges: bool = False,
-    ) -> Mask:
-        options = self._options
-        if options.threshold == 'hsv':
-            return hsv_mask(part, colour)
-        return chromatic_mask(
-            part, colour, options.noise_gate, options.least_contrast, self._window(view),
-            ridges=ridges)
+        """Look for what is no pixel's matter: lines, by all that they run over."""
+        part = self._view.read(image)
+        return self._strips({
+            colour: self._faint(contrast_of(part, colour)) for colour in self._widths}), colours
 
     def _look_by_example(
         self, image: NDArray[np.uint8], known: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look for what looks like the strips that are known."""
-        options, view = self._options, self._view
-        part, window = view.read(image), self._window(view)
+        options = self._options
+        return self._by_example(image, known, colours, self._mask, lambda part, seen: raised_mask(
+            feature_of(part, seen), brightness(part), options.noise_gate, options.least_contrast,
+            self._window))
+
+    def _look_along_by_example(
+        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+    ) -> tuple[Strips, Colours]:
+        """Look along lines for what looks like the strips that are known."""
+        return self._by_example(
+            image, known, colours, lambda part, name: self._faint(contrast_of(part, name)),
+            lambda part, seen: self._faint(feature_of(part, seen)))
+
+    def _by_example(
+        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+        unseen: Callable[[NDArray[np.uint8], str], Mask],
+        mask_of: Callable[[NDArray[np.uint8], LineColour], Mask],
+    ) -> tuple[Strips, Colours]:
+        """Learn the colours of which strips are known, and look again.
+
+        :param unseen: mask of a colour, by its class, of which none is.
+        :param mask_of: of one that was learned.
+        """
+        part = self._view.read(image)
         masks, learned = {}, []
         for colour in colours:
             examples = [strip.pixels for strip in known if strip.colour == colour.name]
             seen = colour if not examples else learned_colour(
-                colour, part, view.places(np.concatenate(examples)), view.region, window)
+                colour, part, self._view.places(np.concatenate(examples)), self._view.region,
+                self._window)
             learned.append(seen)
-            masks[colour.name] = self._mask(part, colour.name, view) if seen is colour else (
-                raised_mask(feature_of(part, seen), brightness(part), options.noise_gate,
-                            options.least_contrast, window))
+            masks[colour.name] = (
+                unseen(part, colour.name) if seen is colour else mask_of(part, seen))
         if all(seen is colour for seen, colour in zip(learned, colours)):
             return known, colours
-        return self._strips(masks, view), tuple(learned)
+        return self._strips(masks), tuple(learned)
 
-    def _window(self, view: ReducedView) -> int:
-        return max(_LEAST_WINDOW, self._options.window // view.pitch)
+    def _mask(self, part: NDArray[np.uint8], colour: str) -> Mask:
+        options = self._options
+        if options.threshold == 'hsv':
+            return hsv_mask(part, colour)
+        return chromatic_mask(
+            part, colour, options.noise_gate, options.least_contrast, self._window)
 
-    def _strips(self, masks: dict[str, Mask], view: ReducedView) -> Strips:
+    def _faint(self, feature: Mask) -> Mask:
+        return faint_line_mask(
+            feature, self._view.region, self._options.noise_gate, self._window)
+
+    def _strips(self, masks: dict[str, Mask]) -> Strips:
         found: list[FloorSegment] = []
         for colour, mask in masks.items():
+            blobs = self._view.blobs(mask, _PIXELS_PER_BLOB)
             found.extend(floor_segments(
-                view.blobs(mask, _PIXELS_PER_BLOB), self._table, self._widths[colour], colour,
-                longest=self._longest))
+                blobs, self._table, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
     def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:

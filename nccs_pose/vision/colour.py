@@ -36,6 +36,9 @@ CONTRASTS: dict[str, tuple[float, float, float]] = {
     'white': (1.0, 1.0, 1.0),
     'black': (-1.0, -1.0, -1.0),
 }
+# The contrast of a tape that no image has shown yet, grey levels: so faint that what is asked for
+# in parts of it binds only once one has.
+_UNSEEN = 10.0
 # A learned contrast further than this from its class, or fainter (grey levels), is not that
 # colour.
 _DRIFT_COSINE = 0.5
@@ -76,7 +79,7 @@ class LineColour:
         # A coloured tape is told by chromaticity: brightness is what the floor varies in.
         coloured = abs(direction.sum()) < 1e-9
         grey = np.full((3, 3), 20.0**2) if coloured else np.zeros((3, 3))
-        return cls(name, 60.0 * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3),
+        return cls(name, _UNSEEN * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3),
                    blur)
 
     @cached_property

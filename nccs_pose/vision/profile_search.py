@@ -26,6 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+# A tape goes on over so many stations; a speck does not.
+_TOGETHER = 5
 # Samples along the curve that one station averages, as fractions of its spacing.
 _ALONG = ((np.arange(4) + 0.5) / 4.0 - 0.5).astype(np.float32)
 
@@ -38,16 +40,15 @@ def search_profiles(
     For a prediction that is several pixels off; good to about a pixel.
     """
     offsets, contrast, _ = contrast_across(image, bands, colour, reach)
-    # A tape goes on from station to station; a speck does not.
-    pooled = cv2.blur(contrast, (1, 5)) if len(bands) > 5 else contrast
+    together = _TOGETHER if len(bands) > _TOGETHER else 1
+    pooled = cv2.blur(contrast, (1, together))
     best = pooled.argmax(axis=1)
     rows = np.arange(len(bands))
-    height = contrast[rows, best]
     # From station to station the tape stays and the noise does not.
-    noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0)
+    noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0 * together)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0),
-        height > max(FOUND * noise, FOUND_FRACTION), rows)
+        pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION), rows)
 
 
 def contrast_across(
@@ -60,7 +61,8 @@ def contrast_across(
     :returns: the places (K,), px; the contrast of the template there (N, K), 1 where it is a
         tape's; and the template's energy (N,), which that contrast's certainty grows with.
     """
-    half = float(np.percentile(bands.half_width, 75)) if len(bands) else 1.0
+    upper = 3 * len(bands) // 4
+    half = float(np.partition(bands.half_width, upper)[upper]) if len(bands) else 1.0
     kernel_half = int(np.ceil((half + 3.0) / step))
     places = int(np.ceil(reach / step))
     side = places + kernel_half

@@ -64,8 +64,7 @@ class Segmentation:
 
 
 def chromatic_mask(
-    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int, *,
-    ridges: bool = False,
+    image: NDArray[np.uint8], colour: str, gate: float, least: float, window: int,
 ) -> Mask:
     """Where the image has more of a colour than its surroundings.
 
@@ -76,10 +75,8 @@ def chromatic_mask(
     :param gate: threshold in standard deviations of the image's noise.
     :param least: smallest contrast that counts, as a fraction of the image's brightness.
     :param window: width of the surroundings, px.
-    :param ridges: take only what stands out to both sides: the rims of large things do not.
     """
-    return raised_mask(
-        _contrast(image, colour), brightness(image), gate, least, window, ridges=ridges)
+    return raised_mask(contrast_of(image, colour), brightness(image), gate, least, window)
 
 
 def brightness(image: NDArray[np.uint8]) -> float:
@@ -88,7 +85,7 @@ def brightness(image: NDArray[np.uint8]) -> float:
 
 
 def raised_mask(
-    feature: Mask, bright: float, gate: float, least: float, window: int, *, ridges: bool = False,
+    feature: Mask, bright: float, gate: float, least: float, window: int,
 ) -> Mask:
     """Where a feature stands out of its surroundings; see :func:`chromatic_mask`.
 
@@ -96,15 +93,10 @@ def raised_mask(
     :param bright: brightness of the image, grey levels.
     """
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
-    if ridges:
-        around = cv2.morphologyEx(feature, cv2.MORPH_OPEN, np.ones((window, window), np.uint8))
-    else:
-        around = cv2.blur(feature, (window, window))
+    around = cv2.blur(feature, (window, window))
     sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
-    # What is left of noise by an opening is above it.
-    usual = float(np.median(sparse)) if ridges else 0.0
-    noise = 1.4826 * float(np.median(np.abs(sparse - usual)))
-    threshold = usual + max(2.0, gate * noise, least * bright)
+    noise = 1.4826 * float(np.median(np.abs(sparse)))
+    threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
@@ -115,8 +107,8 @@ def raised_mask(
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
 
 
-def _contrast(image: NDArray[np.uint8], colour: str) -> Mask:
-    """The colour's contrast in each pixel, 128 (or the brightness, for white) where there is none.
+def contrast_of(image: NDArray[np.uint8], colour: str) -> Mask:
+    """A colour's contrast in each pixel, 128 (or the brightness, for white) where there is none.
 
     The mean of the channels that rise less that of those that fall, in whole grey levels.
     """
