@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
+import math
 
 from nccs_pose.geometry.floor_table import (
     as_complex,
@@ -81,24 +83,29 @@ class BandPredictor:
         self._coarse = (self._start[:, None] + self._distance[..., None]
                         * self._direction[:, None]).reshape(-1, 2)
 
-    def places(self, pose: Pose2, spacing: float, most: int) -> Places:
+    def places(
+        self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
+    ) -> Places:
         """Stations evenly spaced in the image along each visible floor tape.
 
         :param pose: T_map_base.
         :param spacing: of the stations, px, or more.
         :param most: at most so many a line.
+        :param lines: of the map that get any; None for all.
         """
         rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
-        lines = len(self._lines)
+        tapes = len(self._lines)
         pixels = self._table.pixels((self._coarse - position) @ rotation)
-        visible = self._table.sees_floor(pixels).reshape(lines, _COARSE)
-        curve = as_complex(pixels).reshape(lines, _COARSE)
-        arc = np.zeros((lines, _COARSE))
+        visible = self._table.sees_floor(pixels).reshape(tapes, _COARSE)
+        curve = as_complex(pixels).reshape(tapes, _COARSE)
+        arc = np.zeros((tapes, _COARSE))
         np.cumsum(np.abs(curve[:, 1:] - curve[:, :-1]) * (visible[:, 1:] & visible[:, :-1]),
                   axis=1, out=arc[:, 1:])
         length = np.maximum(arc[:, -1] - 2.0 * _END, 0.0)
-        count = np.minimum(min(most, _MOST // max(lines, 1)), length // spacing).astype(int)
-        number = np.arange(lines).repeat(count)
+        count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
+        if lines is not None:
+            count[~np.isin(self._lines, list(lines))] = 0
+        number = np.arange(tapes).repeat(count)
         first = np.cumsum(count) - count
         each = length / np.maximum(count, 1)
         # All lines one after the other on one axis, so that one interpolation serves them; where
@@ -128,9 +135,7 @@ class BandPredictor:
         middle = ((self._start - position) @ rotation).take(number, axis=0)
         middle += distance[:, None] * direction
         if attitude.any():
-            # Floor that sinks under a base that rises is seen where its rays met the plane.
-            middle = self._table.met(middle, attitude[1] * -middle[:, 1]
-                                     + attitude[2] * middle[:, 0] - attitude[0])
+            middle = self._table.met(*_leant(middle, attitude))
         image = self._table.expand(middle)
         # Vectors of the plane are complex numbers from here on: a quarter turn is a factor i,
         # and the product with a conjugate holds the dot product in its real part.
@@ -180,6 +185,24 @@ class BandPredictor:
         slide[:, 4] = slide[:, 3] * point[:, 1]
         slide[:, 5] = -slide[:, 3] * point[:, 0]
         return slide
+
+
+def _leant(points: Array, attitude: Array) -> tuple[Array, Array]:
+    """Where a base off its plane has points of the floor: (N, 2), and how far over z = 0 (N,).
+
+    Roll and pitch as in roll, pitch, yaw: to first order they move points up and down only, but
+    their product turns the floor, as a yaw would.
+
+    :param points: of the floor as the base has them on its plane (N, 2), metres.
+    :param attitude: its (z, roll, pitch) off it (3,), metres and rad.
+    """
+    z, roll, pitch = attitude.tolist()
+    x, y = points[:, 0], points[:, 1]
+    up = math.sin(pitch) * x - math.cos(pitch) * z
+    leant = np.empty_like(points)
+    leant[:, 0] = math.cos(pitch) * x + math.sin(pitch) * z
+    leant[:, 1] = math.cos(roll) * y + math.sin(roll) * up
+    return leant, math.cos(roll) * up - math.sin(roll) * y
 
 
 def _dot(a: Complex, b: Complex) -> Array:

@@ -155,8 +155,7 @@ class FloorTable:
             whole, rig.cop, rig.T_base_mirror.inverse().apply(points.reshape(-1, 3)))
         pixels, in_front = rig.camera.project((m - rig.cop) @ rig.R_mirror_camera)
         seen = (visible & in_front).reshape(points.shape[:2])
-        falls = self._falls_of_rays(points, m, seen)
-        self._falls = falls[..., 0], falls[..., 1]
+        self._mirror_points, falls = self._rays(points, m, seen)
         # Outward, past the foot, and as good as the same all round.
         self._outward = radius[_PADDING + 1:], np.einsum('rai,ai->r', falls[_PADDING + 1:], (
             np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)))
@@ -175,21 +174,25 @@ class FloorTable:
         padded = np.array(rows)
         return spline_filter(padded[..., 0]), spline_filter(padded[..., 1])
 
-    def _falls_of_rays(self, points: Array, m: Array, seen: NDArray[np.bool_]) -> Array:
-        """How far rays go over the floor for each metre that they fall (angles, azimuths, 2).
+    def _rays(
+        self, points: Array, m: Array, seen: NDArray[np.bool_],
+    ) -> tuple[tuple[Array, ...], Array]:
+        """Where rays leave the mirror, and how far over the floor they go as they fall by a metre.
 
-        A ray comes from its own point of the mirror, not from the mirror's origin. Where none is
-        seen stands that of the angle before.
+        Where none is seen stands that of the angle before.
 
         :param points: on the floor (angles, azimuths, 3), in base_link.
         :param m: their mirror points, in the mirror frame (angles x azimuths, 3).
         :param seen: which are seen (angles, azimuths).
+        :returns: x, y and z (angles, azimuths) of the mirror points, in base_link; and the falls
+            (angles, azimuths, 2).
         """
         mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
         falls = (points[..., :2] - mirror[..., :2]) / np.maximum(mirror[..., 2:], 1e-6)
         for row in range(1, len(falls)):
+            mirror[row, ~seen[row]] = mirror[row - 1, ~seen[row]]
             falls[row, ~seen[row]] = falls[row - 1, ~seen[row]]
-        return falls
+        return tuple(np.ascontiguousarray(mirror[..., k]) for k in range(3)), falls
 
     def falls(self, radius: Array) -> Array:
         """How far outward over the floor a ray goes for each metre that it falls (N,).
@@ -204,15 +207,14 @@ class FloorTable:
         :param points: (N, 2), metres.
         :param rise: how far they are over the floor, or under it (N,); small, metres.
         """
-        met = points
-        # The rays a little further on are almost parallel: twice is enough.
-        for _ in range(2):
-            offset = met - self.foot
-            at = self._places(offset, np.hypot(offset[:, 0], offset[:, 1]))
-            fall = np.stack([map_coordinates(component, at, order=1, mode='nearest')
-                             for component in self._falls], axis=1)
-            met = points + rise[:, None] * fall
-        return met
+        offset = points - self.foot
+        at = self._places(offset, np.sqrt(np.einsum('ni,ni->n', offset, offset)))
+        x, y, z = (map_coordinates(component, at, order=1, mode='nearest')
+                   for component in self._mirror_points)
+        # The ray meets the floor a little further on, but comes from the same place.
+        share = rise / np.maximum(z - rise, 0.5 * z)
+        return np.stack([points[:, 0] + share * (points[:, 0] - x),
+                         points[:, 1] + share * (points[:, 1] - y)], axis=1)
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
