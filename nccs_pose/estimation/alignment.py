@@ -85,6 +85,7 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
+    :ivar width: of each map line's tape in the image, on average (L,), px; NaN likewise.
     :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
     """
@@ -99,6 +100,7 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
+    width: Array
     misfit: float
     colours: tuple[LineColour, ...]
 
@@ -280,12 +282,14 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
     correlation, misfit = common_errors(pooled(residual, group), together, label[first])
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
+    in_view = np.where(seen > 0, seen, np.nan)
     return Alignment(
         refinement.pose, correlation * refinement.covariance, refinement,
         LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(np.flatnonzero(there).tolist()), _missing(bands, index),
-        np.where(seen > 0, there / np.maximum(seen, 1), np.nan), misfit, measured.colours)
+        there / in_view, 2.0 * np.bincount(bands.label, bands.half_width, lines) / in_view, misfit,
+        measured.colours)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:

@@ -105,11 +105,12 @@ class Judge:
                  *(k for k in doubts if alignment.support[k] >= 0.0)}
         if found is not None or not asked:
             return found
-        asked -= plainly_in_place(alignment, self._map, self._table)
+        asked -= plainly_in_place(alignment)
         if not asked:
             return None
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
-        places = self._predictor.places(alignment.pose, _CLOSE, self._options.stations)
+        places = self._predictor.places(
+            alignment.pose, _CLOSE, self._options.stations, asked)
         bands, slide = self._predictor.bands(places, alignment.pose)
         moved = slide[:, 3:] @ alignment.refinement.attitude
         for k in sorted(asked):

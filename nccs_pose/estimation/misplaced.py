@@ -30,7 +30,7 @@ from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.profile_search import contrast_across
-from nccs_pose.vision.profiles import fit_profiles
+from nccs_pose.vision.profiles import fit_profiles, median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,7 +59,6 @@ _EVIDENT = 5.0
 _DISTURBED = 0.28
 # It is in its place when it is off by less than this for certain, px.
 _IN_PLACE = 0.5
-_QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 # What lies this near another line, metres beyond its footprint, is that line.
 _ON_ANOTHER = 0.05
 
@@ -76,24 +75,14 @@ class Placement:
     confirmed: bool = False
 
 
-def plainly_in_place(
-    alignment: Alignment, line_map: LineMap, table: FloorTable,
-) -> frozenset[int]:
+def plainly_in_place(alignment: Alignment) -> frozenset[int]:
     """Lines, wide enough to be told from all else, that the pose itself rests on where they are.
 
     They need no second look at the image.
     """
-    mean, deviation = line_offsets(alignment, len(line_map))
-    label = alignment.points.label
-    _, jacobian = table.floor(alignment.points.pixels)
-    # Normals of the lines in base_link, and how far a pixel reaches along them.
-    normals = line_map.directions[:, :2] @ alignment.pose.rotation[:2, :2] @ _QUARTER_TURN
-    reach = np.linalg.norm(np.einsum('pij,pi->pj', jacobian, normals[label]), axis=1)
-    count = np.maximum(np.bincount(label, minlength=len(line_map)), 1)
-    width = line_map.widths * count / np.maximum(
-        np.bincount(label, reach, minlength=len(line_map)), 1e-12)
+    mean, deviation = line_offsets(alignment, len(alignment.support))
     return frozenset(np.flatnonzero(
-        (alignment.support >= _PLAIN_SHARE) & (width >= _PLAIN_WIDTH)
+        (alignment.support >= _PLAIN_SHARE) & (alignment.width >= _PLAIN_WIDTH)
         & (np.abs(mean) + 2.0 * deviation < _IN_PLACE)).tolist())
 
 
@@ -110,7 +99,7 @@ def placement(
     """
     if len(bands) < _LEAST_STATIONS:
         return Placement()
-    width = 2.0 * float(np.median(bands.half_width))
+    width = 2.0 * median(bands.half_width)
     fit, _ = fit_profiles(image, bands, colour)
     found = int(fit.found.sum())
     mean, deviation = _mean_shift(
@@ -161,13 +150,15 @@ def _strongest(
 
     :param scale: of the image across the line (N,), px per metre.
     """
-    farthest = min(_NEAR, reach / float(np.median(scale)))
-    steps = int(np.ceil(farthest * float(np.median(scale)) / _STEP))
+    usual = median(scale)
+    farthest = min(_NEAR, reach / usual)
+    steps = int(np.ceil(farthest * usual / _STEP))
     parallel = farthest / max(steps, 1) * np.arange(-steps, steps + 1.0)
     turn = farthest * np.outer(_TURNS, np.linspace(-1.0, 1.0, len(bands)))
     # (T, D, N), metres on the floor and then px across.
     shift = (parallel[:, None] + turn[:, None, :]) * scale
-    places, contrast, power = contrast_across(image, bands, colour, reach + 1.0, _STEP)
+    side = min(reach, float(np.abs(shift).max())) + 1.0
+    places, contrast, power = contrast_across(image, bands, colour, side, _STEP)
     at = np.clip((shift + moved - places[0]) / _STEP, 0.0, len(places) - 1.001)
     low = at.astype(int)
     station = np.arange(len(bands))
