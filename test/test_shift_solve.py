@@ -94,7 +94,8 @@ def test_stations_are_predicted_under_a_base_that_leans_and_has_risen(degrees: f
     off = np.abs(np.einsum('ni,ni->n', bands.midline - pixels, bands.across))
     moved = np.abs(np.einsum('ni,ni->n', level.midline - pixels, level.across))
     assert moved.max() > 3.0 * degrees
-    assert off.max() < 0.02
+    # What many stations tell together is ten times finer than a hundredth of a pixel.
+    assert off.max() < 0.003
 
 
 def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> None:
