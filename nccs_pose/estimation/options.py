@@ -40,7 +40,7 @@ class LocaliserOptions:
         doc="Threshold of the colour mask in standard deviations of the image's noise.")
     least_contrast: float = option(
         0.05, low=0.0, high=1.0, live=True,
-        doc='Smallest contrast of the colour mask, as a fraction of the image brightness.')
+        doc='Smallest contrast of the first colour mask, as a fraction of the image brightness.')
     window: int = option(
         31, unit='px', low=5, high=301, live=True,
         doc='Width of the surroundings that a line-coloured pixel is compared with; a few times '
