@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from nccs_pose.evaluation.precision import image_bound, straight_scene
+from nccs_pose.evaluation.precision import image_bound, image_information, straight_scene
 from nccs_pose.geometry.pose import Pose2, RigidTransform
 from nccs_pose.simulation.renderer import expected_image
 from nccs_pose.simulation.scene import Scene
@@ -46,8 +46,8 @@ def test_a_height_hardly_unknown_adds_what_least_squares_over_all_pixels_mistake
         (_seen(scene, yaw=STEP) - _seen(scene, yaw=-STEP)) / (2.0 * STEP)]
     raised = (_seen(scene, height=STEP) - _seen(scene, height=-STEP)) / (2.0 * STEP)
     mistaken, *_ = np.linalg.lstsq(np.transpose(slopes), raised, rcond=None)
-    sigma = 3e-5
-    added = image_bound(scene, POSE, sigma) - image_bound(scene, POSE)
+    sigma, information = 3e-5, image_information(scene, POSE)
+    added = image_bound(information, sigma) - image_bound(information)
     # Next to nothing is what the pixels themselves tell of so small a height.
     np.testing.assert_allclose(
         added, sigma**2 * np.outer(mistaken, mistaken), rtol=0.01,
@@ -56,7 +56,7 @@ def test_a_height_hardly_unknown_adds_what_least_squares_over_all_pixels_mistake
 
 def test_pixels_of_half_the_size_and_of_half_the_noise_allow_more() -> None:
     def of(width: int, noise: float) -> np.ndarray:
-        return np.sqrt(np.diag(image_bound(straight_scene(width, noise), POSE)))
+        return np.sqrt(np.diag(image_bound(image_information(straight_scene(width, noise), POSE))))
 
     coarse = of(160, 0.05)
     np.testing.assert_allclose(coarse / of(160, 0.025), 2.0, rtol=1e-3)

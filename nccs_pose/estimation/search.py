@@ -131,18 +131,17 @@ class Searcher:
         :param mask_of: of one that was learned.
         """
         part = self._view.read(image)
-        masks, learned = {}, []
+        learned = []
         for colour in colours:
             examples = [strip.pixels for strip in known if strip.colour == colour.name]
-            seen = colour if not examples else learned_colour(
+            learned.append(colour if not examples else learned_colour(
                 colour, part, self._view.places(np.concatenate(examples)), self._view.region,
-                self._window)
-            learned.append(seen)
-            masks[colour.name] = (
-                unseen(part, colour.name) if seen is colour else mask_of(part, seen))
+                self._window))
         if all(seen is colour for seen, colour in zip(learned, colours)):
             return known, colours
-        return self._strips(masks), tuple(learned)
+        return self._strips({
+            colour.name: unseen(part, colour.name) if seen is colour else mask_of(part, seen)
+            for seen, colour in zip(learned, colours)}), tuple(learned)
 
     def _mask(self, part: NDArray[np.uint8], colour: str) -> Mask:
         options = self._options

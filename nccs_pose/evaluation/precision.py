@@ -38,6 +38,7 @@ from nccs_pose.estimation.paper import paper_estimate
 from nccs_pose.estimation.refine import refine
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, wrap_angle
+from nccs_pose.geometry.small_matrices import inverse
 from nccs_pose.simulation.renderer import expected_image, render
 from nccs_pose.simulation.scene import ideal_scene, Scene
 from nccs_pose.vision.segment import hsv_mask
@@ -109,32 +110,40 @@ def straight_scene(width: int, noise: float) -> Scene:
         scene, rig=dataclasses.replace(scene.rig, T_base_mirror=straight))
 
 
-def image_bound(scene: Scene, pose: Pose2, height_sigma: float = 0.0) -> Array:
-    """Cramér-Rao bound (3, 3) of (x, y, yaw) given all pixels of one image.
+def image_information(scene: Scene, pose: Pose2) -> Array:
+    """What all pixels of one image tell of (x, y, yaw, height of the mirror) (4, 4).
 
-    Independent noise of the scene's read noise and of rounding on every channel; everything but
-    the pose and the mirror's height is taken as known.
+    Independent noise of the scene's read noise and of rounding on every channel; everything else
+    is taken as known.
 
     :param scene: with read noise alone, and a linear response.
-    :param height_sigma: how well the mirror's height is known, metres; 0 for exactly.
     :raises OptionError: if there is no noise, which leaves no bound.
     """
     sensor = scene.sensor
     if not (sensor.read_noise > 0.0 and sensor.shot_noise == 0.0 and sensor.gamma == 1.0):
         raise OptionError('the bound needs read noise alone, and a linear response')
     rows = []
-    for step in _STEP * np.eye(4 if height_sigma > 0.0 else 3):
+    for step in _STEP * np.eye(4):
         ahead, behind = (
-            expected_image(_raised(scene, sign * step[3:].sum()),
+            expected_image(_raised(scene, sign * step[3]),
                            Pose2.from_array(pose.as_array() + sign * step[:3]))
             for sign in (1.0, -1.0))
         rows.append((ahead - behind).ravel() / (2.0 * _STEP))
     slope = np.array(rows, dtype=float)
     variance = (255.0 * sensor.read_noise) ** 2 + 1.0 / 12.0
-    information = slope @ slope.T / variance
+    return slope @ slope.T / variance
+
+
+def image_bound(information: Array, height_sigma: float = 0.0) -> Array:
+    """Cramér-Rao bound (3, 3) of (x, y, yaw).
+
+    :param information: of an image, see :func:`image_information` (4, 4).
+    :param height_sigma: how well the mirror's height is known, metres; 0 for exactly.
+    """
+    told = information[:3, :3]
     if height_sigma > 0.0:
-        information[3, 3] += height_sigma**-2
-    return np.linalg.inv(information)[:3, :3]
+        told = information + np.diag([0.0, 0.0, 0.0, height_sigma**-2])
+    return inverse(told)[:3, :3]
 
 
 def _raised(scene: Scene, height: float) -> Scene:
@@ -220,8 +229,9 @@ def run_precision(
         rng = np.random.default_rng([seed, width, k])
         pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (*_SPREAD, np.pi))
         image = render(scene, pose, rng)
-        bounds.append(image_bound(scene, pose))
-        height_bounds.append(image_bound(scene, pose, default.height_sigma))
+        information = image_information(scene, pose)
+        bounds.append(image_bound(information))
+        height_bounds.append(image_bound(information, default.height_sigma))
         found = _by_sampling(scene, pose, image, rng)
         for name, localiser in localisers.items():
             localiser.relocalise()
