@@ -30,6 +30,7 @@ from nccs_pose.ros.conversions import ns_to_stamp
 from nccs_pose.ros.start import initialise, interrupt_once, leave
 from nccs_pose.ros.transport import use_large_images
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -41,6 +42,9 @@ CLOCK_PERIOD = 0.01
 """Seconds between two /clock messages."""
 
 SETTLE = 0.5
+
+TAKEN_TIMEOUT = 2.0
+"""Seconds to wait at the end for who listens reliably; one of them may hang."""
 
 OnSent = Callable[[str, bytes], None]
 
@@ -121,7 +125,8 @@ class Player:
         while True:
             self._play_once(on_sent)
             if not (self._playback.loop and rclpy.ok()):
-                return
+                break
+        self._wait_until_taken()
 
     def _play_once(self, on_sent: OnSent | None) -> None:
         bag_start = self._bag.start_ns + round(1e9 * self._playback.start_offset)
@@ -135,6 +140,15 @@ class Player:
                 on_sent(topic, data)
             self._publishers[topic].publish(data)
             self.sent[topic] += 1
+
+    def _wait_until_taken(self) -> None:
+        """Wait for who listens reliably: what they have not got is lost when we leave."""
+        end = time.monotonic() + TAKEN_TIMEOUT
+        publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
+        while rclpy.ok() and time.monotonic() < end:
+            if all(publisher.wait_for_all_acked(Duration()) for publisher in publishers):
+                return
+            time.sleep(CLOCK_PERIOD)
 
     def _wait_until(self, due: float, received_ns: int) -> None:
         """Sleep; /clock goes on meanwhile."""
