@@ -12,15 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Errors that neighbours share, against errors drawn with a known share."""
+"""Errors that neighbours share, against errors drawn with known shares."""
 
 from __future__ import annotations
 
-from nccs_pose.estimation.common_errors import common_errors
+import math
+
+from nccs_pose.estimation.common_errors import common_misfit, correlation_factor
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-LINES, PER_LINE = 4, 24
+LINES, PER_LINE = 4, 60
 LABEL = np.repeat(np.arange(LINES), PER_LINE)
 SIGMA = np.full(len(LABEL), 0.05)
 # Two shifts and a turn of four lines round the robot, which a pose takes out of the residuals.
@@ -30,52 +33,91 @@ POSE = np.linalg.qr(np.stack([
     np.where(LABEL == 1, 1.0, 0.0) - np.where(LABEL == 3, 1.0, 0.0), ALONG], axis=1))[0]
 
 
-def _factors(blocks: float, size: float, trials: int = 300) -> tuple[float, float, float]:
-    """Errors of a size, this share of whose variance a block shares.
+def _squared_errors(b: list[float], a: list[float], trials: int = 600) -> tuple[float, float]:
+    """Errors that run through the filter b / a along each line, from white noise.
 
-    :returns: mean factor and misfit, and the variance of what a pose takes out over that which
-        independent errors would give it.
+    :returns: mean factor, and the mean square of what a pose takes out, in units of the variance
+        that the residuals and the factor claim for it; 1 where they are right.
     """
     rng, found = np.random.default_rng(3), []
     for _ in range(trials):
-        common = np.repeat(rng.standard_normal(len(LABEL) // 4), 4)
-        own = rng.standard_normal(len(LABEL))
-        error = size * (np.sqrt(blocks) * common + np.sqrt(1.0 - blocks) * own)
+        error = lfilter(b, a, rng.standard_normal((LINES, 2 * PER_LINE)))[:, PER_LINE:].ravel()
         taken = POSE.T @ error
         residual = error - POSE @ taken
-        degrees = len(error) - 3
-        found.append((*common_errors(residual, SIGMA, LABEL),
-                      np.mean(taken**2) * degrees / (residual @ residual)))
-    factor, misfit, true = np.mean(found, axis=0)
-    return float(factor), float(misfit), float(true)
+        factor = correlation_factor(residual, LABEL, 3)
+        claimed = factor * (residual @ residual) / (len(residual) - 3)
+        found.append((factor, np.mean(taken**2) / claimed))
+    factor, nees = np.mean(found, axis=0)
+    return float(factor), float(nees)
 
 
-def test_the_noise_of_pixels_is_left_as_it_is() -> None:
-    factor, misfit, true = _factors(0.0, 1.0)
-    # The largest of several estimates is taken: a little too careful.
-    assert true < factor < 1.25 * true
-    assert misfit < 0.5 * SIGMA[0]
+def test_independent_errors_are_told_as_such() -> None:
+    factor, nees = _squared_errors([1.0], [1.0])
+    assert factor == pytest.approx(1.0, abs=0.06)
+    # Of 1800 squares.
+    assert nees == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 1800.0))
 
 
-@pytest.mark.parametrize('share', [0.2, 0.4, 0.7])
-def test_what_a_block_shares_counts_once(share: float) -> None:
-    factor, misfit, true = _factors(share, 2.0)
-    assert true > 1.4
-    assert factor == pytest.approx(true, rel=0.3)
+@pytest.mark.parametrize(('b', 'a'), [
+    ([1.0, 0.2], [1.0]),
+    ([1.0, -0.2], [1.0]),
+    ([1.0], [1.0, -0.2]),
+    ([1.0], [1.0, 0.2]),
+])
+def test_what_neighbours_share_or_take_from_each_other_is_counted(
+        b: list[float], a: list[float]) -> None:
+    # Long sums of filtered noise have the variance of the filter's gain at rest.
+    white = lfilter(b, a, np.eye(1, 200)[0])
+    true = float(white.sum() ** 2 / (white @ white))
+    factor, nees = _squared_errors(b, a)
+    assert abs(true - 1.0) > 0.3
+    assert factor == pytest.approx(true, rel=0.25)
+    assert nees == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize(('b', 'a'), [
+    # Tiles under several stations, and what alternates: farther than what is looked at.
+    ([1.0] * 2, [1.0]), ([1.0] * 3, [1.0]), ([1.0] * 5, [1.0]), ([1.0], [1.0, 0.4]),
+])
+def test_what_many_neighbours_share_is_rather_overrated(b: list[float], a: list[float]) -> None:
+    white = lfilter(b, a, np.eye(1, 200)[0])
+    factor, nees = _squared_errors(b, a)
+    assert factor > float(white.sum() ** 2 / (white @ white))
+    assert nees < 1.0
+
+
+def test_ends_of_two_lines_are_no_neighbours() -> None:
+    label = np.repeat([0, 1], 30)
+    rng = np.random.default_rng(5)
+    one = rng.standard_normal(60)
+    two = one.copy()
+    # Were the end of the first and the start of the second neighbours, this would change it.
+    two[28:32] *= np.sign(two[28:32])
+    two[28:30] *= -1.0
+    same = one.copy()
+    same[28:32] = two[28:32]
+    turned = same.copy()
+    turned[:30] *= -1.0
+    assert correlation_factor(turned, label, 3) == pytest.approx(
+        correlation_factor(same, label, 3), rel=1e-12)
+
+
+def test_few_residuals_are_no_obstacle() -> None:
+    label = np.array([0, 1, 1, 2, 2, 2])
+    assert 1.0 < correlation_factor(np.full(6, 0.5), label, 3) <= math.exp(2.4)
+    assert common_misfit(np.full(6, 0.5), np.full(6, 0.1), label) == 0.0
+
+
+@pytest.mark.parametrize('share', [0.0, 0.2, 0.4, 0.7])
+def test_misfit_is_what_blocks_share_beyond_noise(share: float) -> None:
+    rng, found = np.random.default_rng(3), []
+    for _ in range(300):
+        common = np.repeat(rng.standard_normal(len(LABEL) // 4), 4)
+        own = rng.standard_normal(len(LABEL))
+        error = 2.0 * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own)
+        residual = error - POSE @ (POSE.T @ error)
+        found.append(common_misfit(residual, SIGMA, LABEL))
     # Blocks' means scatter by what they share and a quarter of the rest; all errors being
     # independent, it would be a quarter of all.
-    assert misfit == pytest.approx(2.0 * SIGMA[0] * np.sqrt(0.75 * share), rel=0.25)
-
-
-def test_larger_errors_than_the_pixels_make_are_taken_for_patterns() -> None:
-    one, two, four = (_factors(0.0, size)[0] for size in (1.0, 2.0, 4.0))
-    assert one < two < four
-
-
-def test_a_line_of_one_or_two_residuals_is_no_obstacle() -> None:
-    label = np.array([0, 1, 1, 2, 2, 2])
-    factor, misfit = common_errors(np.full(6, 0.5), np.full(6, 0.1), label)
-    # By hand: the halves of the two longer lines give 5 over what independent errors would, in one
-    # degree of freedom, beside five times the 1 that such small errors let expect.
-    assert factor == pytest.approx((5.0 + 5.0) / (5.0 + 1.0))
-    assert misfit == 0.0
+    assert np.mean(found) == pytest.approx(
+        2.0 * SIGMA[0] * np.sqrt(0.75 * share), rel=0.25, abs=0.5 * SIGMA[0])

@@ -40,6 +40,11 @@ def slide() -> np.ndarray:
     return predictor.bands(predictor.places(POSE, 16.0, 75), POSE)[1]
 
 
+def _each(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Groups of stations of which each stands for itself, on one line."""
+    return np.arange(count), np.zeros(count, dtype=int)
+
+
 def _off_plane(rig: Rig, unknown: int, step: float) -> Rig:
     """The rig on a base that has risen, or turned about its x or y axis, by a little."""
     rpy, rise = np.zeros(3), np.zeros(3)
@@ -103,7 +108,7 @@ def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> Non
     sigma = rng.uniform(0.5, 2.0, len(slide))
     shift = slide[:, :3] @ [0.004, -0.006, 0.003] + 0.01 * sigma * rng.uniform(
         -1.0, 1.0, len(slide))
-    found = solve_shifts(shift, 0.01 * sigma, slide, np.arange(len(slide)), POSE)
+    found = solve_shifts(shift, 0.01 * sigma, slide, *_each(len(slide)), POSE)
     assert found.inlier.all()
     best = least_squares(lambda v: (shift - slide[:, :3] @ v) / sigma, np.zeros(3), xtol=1e-15)
     np.testing.assert_allclose(
@@ -116,7 +121,7 @@ def test_a_third_of_outliers_changes_little(slide: np.ndarray) -> None:
     shift = slide[:, :3] @ step + 0.02 * rng.standard_normal(len(slide))
     wrong = rng.random(len(slide)) < 0.3
     shift[wrong] += rng.uniform(0.5, 3.0, int(wrong.sum()))
-    found = solve_shifts(shift, np.full(len(slide), 0.02), slide, np.arange(len(slide)), POSE)
+    found = solve_shifts(shift, np.full(len(slide), 0.02), slide, *_each(len(slide)), POSE)
     assert not found.inlier[wrong].any()
     error = found.pose.as_array() - POSE.as_array() - step
     assert error @ np.linalg.solve(found.covariance, error) < 16.3
@@ -132,8 +137,8 @@ def test_what_disturbs_a_stretch_is_seen_in_its_sum() -> None:
         # No station tells by itself that it is 2.5 sigma off; six of them do together.
         wrong = np.isin(group, rng.permutation(group[-1] + 1)[:6])
         shift = 0.02 * rng.standard_normal(len(slide)) + 0.05 * wrong
-        each = solve_shifts(shift, sigma, slide, np.arange(len(slide)), POSE)
-        found = solve_shifts(shift, sigma, slide, group, POSE)
+        each = solve_shifts(shift, sigma, slide, *_each(len(slide)), POSE)
+        found = solve_shifts(shift, sigma, slide, group, np.zeros(len(slide), int), POSE)
         refused.append([(~found.inlier[wrong]).mean(), (~found.inlier[~wrong]).mean()])
         squares.append([
             np.square(way.pose.as_array() - POSE.as_array()) for way in (found, each)])
@@ -154,7 +159,7 @@ def test_the_covariance_is_the_scatter(
         off = deviation * rng.standard_normal(3)
         shift = slide[:, 3:] @ off + 0.05 * rng.standard_normal(len(slide))
         found = solve_shifts(
-            shift, np.full(len(slide), 0.05), slide, np.arange(len(slide)), POSE,
+            shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE,
             attitude_sigma=attitude)
         error = found.pose.as_array() - POSE.as_array()
         nees.append(error @ np.linalg.solve(found.covariance, error))
@@ -164,8 +169,8 @@ def test_the_covariance_is_the_scatter(
 
 def test_the_sigma_told_is_relative(slide: np.ndarray) -> None:
     shift = 0.05 * np.random.default_rng(4).standard_normal(len(slide))
-    one = solve_shifts(shift, np.full(len(slide), 0.05), slide, np.arange(len(slide)), POSE)
-    two = solve_shifts(shift, np.full(len(slide), 0.1), slide, np.arange(len(slide)), POSE)
+    one = solve_shifts(shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
+    two = solve_shifts(shift, np.full(len(slide), 0.1), slide, *_each(len(slide)), POSE)
     np.testing.assert_allclose(one.covariance, two.covariance, rtol=0.1)
 
 
@@ -175,7 +180,7 @@ def test_a_prior_decides_what_the_stations_leave_open(slide: np.ndarray) -> None
     blind[:, 0] = 300.0
     covariance = np.diag([1.0, 0.04, 0.01])
     found = solve_shifts(
-        np.full(len(slide), 3.0), np.full(len(slide), 0.05), blind, np.arange(len(slide)), POSE,
+        np.full(len(slide), 3.0), np.full(len(slide), 0.05), blind, *_each(len(slide)), POSE,
         prior=(Pose2(0.3, 0.1, 0.5), covariance))
     np.testing.assert_allclose(found.pose.as_array(), [0.31, 0.1, 0.5], atol=1e-3)
     np.testing.assert_allclose(np.diag(found.covariance)[1:], [0.04, 0.01], rtol=1e-2)
@@ -188,7 +193,7 @@ def test_what_the_calibration_shifts_no_number_of_stations_averages_out(
     shift = 0.001 * np.random.default_rng(6).standard_normal(len(slide))
     sigma = np.full(len(slide), 0.001)
     found = solve_shifts(
-        shift, sigma, slide, np.arange(len(slide)), POSE, image_shift=across,
+        shift, sigma, slide, *_each(len(slide)), POSE, image_shift=across,
         calibration_sigma=0.1)
     # A shift of the image by (u, v) moves the pose by -G (u, v), G from least squares.
     moved = np.linalg.lstsq(slide[:, :3], across, rcond=None)[0]

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from nccs_pose.estimation.common_errors import common_errors, root_mean_square
+from nccs_pose.estimation.common_errors import common_misfit, root_mean_square
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
@@ -226,15 +226,15 @@ class Aligner:
             return None
         return self._solved(
             shift[found], np.ones(int(found.sum())), slide[found], np.flatnonzero(found),
-            bands.across[found], start, prior).pose
+            bands.label[found], bands.across[found], start, prior).pose
 
     def _solved(
-        self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp], across: Array,
-        start: Pose2, prior: tuple[Pose2, Array] | None,
+        self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp],
+        label: NDArray[np.intp], across: Array, start: Pose2, prior: tuple[Pose2, Array] | None,
     ) -> Refinement:
         options = self._options
         return solve_shifts(
-            shift, sigma, slide, group, start, prior=prior,
+            shift, sigma, slide, group, label, start, prior=prior,
             attitude_sigma=(options.height_sigma, options.tilt_sigma),
             image_shift=across, calibration_sigma=options.calibration_sigma)
 
@@ -260,8 +260,8 @@ class Aligner:
             return None
         refinement = self._solved(
             (fit.shift + slide[:, 3:] @ attitude).take(at), fit.sigma.take(at),
-            slide.take(at, axis=0), fit.group.take(at), bands.across.take(at, axis=0), start,
-            prior)
+            slide.take(at, axis=0), fit.group.take(at), bands.label.take(at),
+            bands.across.take(at, axis=0), start, prior)
         moved = slide[:, :3] @ refinement.pose.minus(start) + slide[:, 3:] @ (
             refinement.attitude - attitude)
         return _Measured(
@@ -280,11 +280,11 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, _ = runs(group)
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
-    correlation, misfit = common_errors(pooled(residual, group), together, label[first])
+    misfit = common_misfit(pooled(residual, group), together, label[first])
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     in_view = np.where(seen > 0, seen, np.nan)
     return Alignment(
-        refinement.pose, correlation * refinement.covariance, refinement,
+        refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(np.flatnonzero(there).tolist()), _missing(bands, index),

@@ -21,6 +21,7 @@ pose; who predicts again at the pose found makes it exact.
 
 from __future__ import annotations
 
+from nccs_pose.estimation.common_errors import correlation_factor
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import definite_solution, inverse
@@ -45,6 +46,7 @@ def solve_shifts(
     sigma: Array,
     slide: Array,
     group: NDArray[np.intp],
+    label: NDArray[np.intp],
     start: Pose2,
     *,
     prior: tuple[Pose2, Array] | None = None,
@@ -56,14 +58,15 @@ def solve_shifts(
 
     Re-weighted least squares under Cauchy's loss with its scale estimated from the residuals,
     then least squares over the inliers, from which the covariance comes; ``sigma`` is taken for
-    relative there, and its scale from the residuals. What is robustly weighted is the sum of
-    neighbours' residuals: what disturbs a stretch of line disturbs all of it, and shows in the
-    sum before it shows in any one.
+    relative there, its scale comes from the residuals and from what neighbours have in common.
+    What is robustly weighted is the sum of neighbours' residuals: what disturbs a stretch of line
+    disturbs all of it, and shows in the sum before it shows in any one.
 
     :param shift: of the stations (N,), px.
     :param sigma: their standard deviations (N,), px.
     :param slide: d(shift)/d(x, y, yaw, z, roll, pitch) (N, 6).
     :param group: of neighbours that each belongs to (N,), those of a group together.
+    :param label: map line of each (N,), ascending, along each line in order.
     :param start: the predicted pose, T_map_base.
     :param prior: a pose with its covariance (3, 3), weighed in like a measurement.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
@@ -97,13 +100,16 @@ def solve_shifts(
     inlier = trusted.repeat(members)
     normal, right = _normal(rows, inlier.astype(float))
     # The prior's share is weighed against residuals of the size that they have.
-    inflation = _inflation(e[trusted])
+    inliers = rows[inlier]
+    e = _residual(inliers, unknowns)
+    correlation = correlation_factor(e, label[inlier], len(free))
+    inflation = correlation * _inflation(e, len(free))
     unknowns = definite_solution(normal / inflation + known, right / inflation + told)
-    inflation = _inflation((sums[:, -1] - sums[:, :-1] @ unknowns)[trusted])
+    inflation = correlation * _inflation(_residual(inliers, unknowns), len(free))
     covariance = definite_solution(normal / inflation + known, np.eye(len(free)))
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
-        answer = covariance @ (rows[inlier, :-1].T @ moved) * (calibration_sigma / inflation)
+        answer = covariance @ (inliers[:, :-1].T @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     attitude = np.zeros(3)
     for unknown, value in zip(free[3:], unknowns[3:].tolist()):
@@ -111,7 +117,7 @@ def solve_shifts(
     return Refinement(
         Pose2(start.x + unknowns[0], start.y + unknowns[1], start.yaw + unknowns[2]),
         0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
-        rows[:, -1] - rows[:, :-1] @ unknowns, inlier, scale, True)
+        _residual(rows, unknowns), inlier, scale, True)
 
 
 def _prior(
@@ -141,9 +147,15 @@ def _normal(rows: Array, weight: Array) -> tuple[Array, Array]:
     return weighed[:-1, :-1], weighed[:-1, -1]
 
 
-def _inflation(e: Array) -> float:
-    """Variance of the inlying groups' residuals (G,) against the noise told."""
-    return max(1e-6, float(e @ e) / (_WITHIN_GATE * max(1, len(e) - 3)))
+def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
+    """Of stations' rows (N, K + 1) at the unknowns (K,)."""
+    return rows[:, -1] - rows[:, :-1] @ unknowns
+
+
+def _inflation(residual: Array, unknowns: int) -> float:
+    """Variance of the inlying stations' residuals (N,) against the noise told."""
+    degrees = max(1, len(residual) - unknowns)
+    return max(1e-6, float(residual @ residual) / (_WITHIN_GATE * degrees))
 
 
 def _robust_scale(e: Array) -> float:
