@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 # Coarse samples of each line, between which its image's length is interpolated.
 _COARSE = 32
-_SLOPE = 1e-9 * np.arange(_COARSE)
+_SLOPE = 1e-9
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
 # So many stations at most, on all lines together.
@@ -80,6 +80,7 @@ class BandPredictor:
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
         self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
+        self._slope = _SLOPE * np.arange(self._distance.size)
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
@@ -95,26 +96,27 @@ class BandPredictor:
         origin, along = self._in_base(pose)
         pixels = self._table.pixels(as_points(
             origin[:, None] + self._distance * along[:, None]))
-        visible = self._table.sees_floor(pixels).reshape(tapes, _COARSE)
-        curve = as_complex(pixels).reshape(tapes, _COARSE)
-        arc = np.zeros((tapes, _COARSE))
-        np.cumsum(np.abs(curve[:, 1:] - curve[:, :-1]) * (visible[:, 1:] & visible[:, :-1]),
-                  axis=1, out=arc[:, 1:])
-        length = np.maximum(arc[:, -1] - 2.0 * _END, 0.0)
+        visible, curve = self._table.sees_floor(pixels), as_complex(pixels)
+        # All lines one after the other on one axis, so that one interpolation serves them; where
+        # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
+        # invertible.
+        steps = np.abs(curve[1:] - curve[:-1])
+        steps *= visible[1:] & visible[:-1]
+        steps[_COARSE - 1::_COARSE] = 0.0
+        axis = np.zeros(len(curve))
+        np.cumsum(steps, out=axis[1:])
+        begin = axis[::_COARSE]
+        length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
         count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
         if lines is not None:
             count[~np.isin(self._lines, list(lines))] = 0
         number = np.arange(tapes).repeat(count)
         first = np.cumsum(count) - count
         each = length / np.maximum(count, 1)
-        # All lines one after the other on one axis, so that one interpolation serves them; where
-        # a line is hidden its arc is flat, and a tiny slope keeps it invertible.
-        begin = np.cumsum(arc[:, -1] + 1.0) - arc[:, -1]
-        axis = (arc + (_SLOPE + begin[:, None])).ravel()
         spacing_px = each.take(number)
         where = np.arange(0.5, len(number)) * spacing_px + (
             begin + _END - first * each).take(number)
-        distance = np.interp(where, axis, self._distance.ravel())
+        distance = np.interp(where, axis + self._slope, self._distance.ravel())
         return Places(number, distance, spacing_px)
 
     def bands(
@@ -163,7 +165,7 @@ class BandPredictor:
                 & (distance < self._length.take(number) - reach))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number))
-        slide = np.empty((len(number), 6))
+        slide = np.empty((6, len(number))).T
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
         # along its line does not count.
         np.multiply(-gain[:, None], self._left.take(number, axis=0), out=slide[:, :2])
