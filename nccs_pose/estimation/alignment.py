@@ -22,7 +22,7 @@ from nccs_pose.estimation.common_errors import common_misfit, root_mean_square
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import pooled, solve_shifts
+from nccs_pose.estimation.shift_solve import solve_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -85,7 +85,6 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
-    :ivar width: of each map line's tape in the image, on average (L,), px; NaN likewise.
     :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
     """
@@ -100,19 +99,18 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
-    width: Array
     misfit: float
     colours: tuple[LineColour, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """One pass: what the stations say, and the pose that follows."""
+    """One pass: what the stations say, which of them are used, and the pose that follows."""
 
     refinement: Refinement
     bands: Bands
     fit: ProfileFit
-    used: NDArray[np.bool_]
+    used: NDArray[np.intp]
     moved: float
     colours: tuple[LineColour, ...]
 
@@ -252,16 +250,15 @@ class Aligner:
         if len(bands) < _LEAST_STATIONS:
             return None
         fit, colours = self._fit(image, bands, colours, rough)
-        used = fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)
-        at = np.flatnonzero(used)
-        if len(at) < _LEAST_STATIONS:
+        used = np.flatnonzero(fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma))
+        if len(used) < _LEAST_STATIONS:
             return None
-        if not rough and float(bands.spacing @ used) < _LEAST_LENGTH:
+        if not rough and float(bands.spacing.take(used).sum()) < _LEAST_LENGTH:
             return None
         refinement = self._solved(
-            (fit.shift + slide[:, 3:] @ attitude).take(at), fit.sigma.take(at),
-            slide.take(at, axis=0), fit.group.take(at), bands.label.take(at),
-            bands.across.take(at, axis=0), start, prior)
+            (fit.shift + slide[:, 3:] @ attitude).take(used), fit.sigma.take(used),
+            slide.take(used, axis=0), fit.group.take(used), bands.label.take(used),
+            bands.across.take(used, axis=0), start, prior)
         moved = slide[:, :3] @ refinement.pose.minus(start) + slide[:, 3:] @ (
             refinement.attitude - attitude)
         return _Measured(
@@ -271,25 +268,23 @@ class Aligner:
 def _alignment(measured: _Measured, lines: int) -> Alignment:
     """What a last pass over a map of so many lines comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
-    index = np.flatnonzero(measured.used)[refinement.inlier]
-    group = fit.group.take(index)
+    index = measured.used[refinement.inlier]
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.
     worth = bands.spacing * np.minimum(1.0, bands.half_width)
     residual = refinement.residual[refinement.inlier]
     sigma, label = fit.sigma.take(index), bands.label.take(index)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
-    first, _ = runs(group)
+    first, members = runs(fit.group.take(index))
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
-    misfit = common_misfit(pooled(residual, group), together, label[first])
+    misfit = common_misfit(
+        np.add.reduceat(residual, first) / np.sqrt(members), together, label[first])
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
-    in_view = np.where(seen > 0, seen, np.nan)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(np.flatnonzero(there).tolist()), _missing(bands, index),
-        there / in_view, 2.0 * np.bincount(bands.label, bands.half_width, lines) / in_view, misfit,
-        measured.colours)
+        there / np.where(seen > 0, seen, np.nan), misfit, measured.colours)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:

@@ -83,12 +83,16 @@ class _Stopwatch:
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
-        self.times = StageTimes()
+        self._seconds: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
         now = time.perf_counter()
-        self.times = replace(self.times, **{stage: getattr(self.times, stage) + now - self._last})
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
         self._last = now
+
+    @property
+    def times(self) -> StageTimes:
+        return StageTimes(**self._seconds)
 
 
 class Localiser:

@@ -76,13 +76,13 @@ class Placement:
 
 
 def plainly_in_place(alignment: Alignment) -> frozenset[int]:
-    """Lines, wide enough to be told from all else, that the pose itself rests on where they are.
+    """Lines that the pose itself rests on, most of each, where they are.
 
     They need no second look at the image.
     """
     mean, deviation = line_offsets(alignment, len(alignment.support))
     return frozenset(np.flatnonzero(
-        (alignment.support >= _PLAIN_SHARE) & (alignment.width >= _PLAIN_WIDTH)
+        (alignment.support >= _PLAIN_SHARE)
         & (np.abs(mean) + 2.0 * deviation < _IN_PLACE)).tolist())
 
 

@@ -24,7 +24,6 @@ from nccs_pose.geometry.floor_table import (
     as_complex,
     as_points,
     Complex,
-    FloorExpansion,
     FloorTable,
 )
 from nccs_pose.geometry.lines import LineMap
@@ -35,7 +34,7 @@ from numpy.typing import NDArray
 
 # Coarse samples of each line, between which its image's length is interpolated.
 _COARSE = 32
-_SLOPE = 1e-9 * np.arange(_COARSE)
+_SLOPE = 1e-9
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
 # So many stations at most, on all lines together.
@@ -75,13 +74,13 @@ class BandPredictor:
             k for k, line in enumerate(line_map)
             if line.width > 0.0 and line.is_horizontal and abs(line.start[2]) < 1e-6],
             dtype=np.intp)
-        self._start = line_map.starts[self._lines, :2]
-        self._direction = line_map.directions[self._lines, :2]
+        self._start = as_complex(line_map.starts[self._lines, :2])
+        self._direction = as_complex(line_map.directions[self._lines, :2])
+        self._left = as_points(1j * self._direction)
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
         self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
-        self._coarse = (self._start[:, None] + self._distance[..., None]
-                        * self._direction[:, None]).reshape(-1, 2)
+        self._slope = _SLOPE * np.arange(self._distance.size)
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
@@ -93,29 +92,31 @@ class BandPredictor:
         :param most: at most so many a line.
         :param lines: of the map that get any; None for all.
         """
-        rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
         tapes = len(self._lines)
-        pixels = self._table.pixels((self._coarse - position) @ rotation)
-        visible = self._table.sees_floor(pixels).reshape(tapes, _COARSE)
-        curve = as_complex(pixels).reshape(tapes, _COARSE)
-        arc = np.zeros((tapes, _COARSE))
-        np.cumsum(np.abs(curve[:, 1:] - curve[:, :-1]) * (visible[:, 1:] & visible[:, :-1]),
-                  axis=1, out=arc[:, 1:])
-        length = np.maximum(arc[:, -1] - 2.0 * _END, 0.0)
+        origin, along = self._in_base(pose)
+        pixels = self._table.pixels(as_points(
+            origin[:, None] + self._distance * along[:, None]))
+        visible, curve = self._table.sees_floor(pixels), as_complex(pixels)
+        # All lines one after the other on one axis, so that one interpolation serves them; where
+        # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
+        # invertible.
+        steps = np.abs(curve[1:] - curve[:-1])
+        steps *= visible[1:] & visible[:-1]
+        steps[_COARSE - 1::_COARSE] = 0.0
+        axis = np.zeros(len(curve))
+        np.cumsum(steps, out=axis[1:])
+        begin = axis[::_COARSE]
+        length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
         count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
         if lines is not None:
             count[~np.isin(self._lines, list(lines))] = 0
         number = np.arange(tapes).repeat(count)
         first = np.cumsum(count) - count
         each = length / np.maximum(count, 1)
-        # All lines one after the other on one axis, so that one interpolation serves them; where
-        # a line is hidden its arc is flat, and a tiny slope keeps it invertible.
-        begin = np.cumsum(arc[:, -1] + 1.0) - arc[:, -1]
-        axis = (arc + (_SLOPE + begin[:, None])).ravel()
         spacing_px = each.take(number)
         where = np.arange(0.5, len(number)) * spacing_px + (
             begin + _END - first * each).take(number)
-        distance = np.interp(where, axis, self._distance.ravel())
+        distance = np.interp(where, axis + self._slope, self._distance.ravel())
         return Places(number, distance, spacing_px)
 
     def bands(
@@ -129,62 +130,59 @@ class BandPredictor:
             (N, 6), px per metre and rad; the last three as small motions of the base off its
             plane.
         """
-        rotation, position = pose.rotation[:2, :2], np.array([pose.x, pose.y])
         number, distance = places.number, places.distance
-        direction = (self._direction @ rotation).take(number, axis=0)
-        middle = ((self._start - position) @ rotation).take(number, axis=0)
-        middle += distance[:, None] * direction
+        origin, along = self._in_base(pose)
+        ahead_of = along.take(number)
+        middle = origin.take(number) + distance * ahead_of
         if attitude.any():
-            middle = self._table.met(*_leant(middle, attitude))
-        image = self._table.expand(middle)
-        # Vectors of the plane are complex numbers from here on: a quarter turn is a factor i,
-        # and the product with a conjugate holds the dot product in its real part.
-        ahead_of = image.polar(as_complex(direction))
-        left_of = 1j * ahead_of
-        ahead, aside = image.slope(ahead_of), image.slope(left_of)
+            middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
+        image = self._table.expand(as_points(middle))
+        behind_of = ahead_of.conj()
+        pixels, by_step, by_conjugate, twice, mixed, conjugate_twice = image.terms.T
+        by_step, by_conjugate = by_step * ahead_of, by_conjugate * behind_of
+        twice, conjugate_twice = (
+            twice * (ahead_of * ahead_of), conjugate_twice * (behind_of * behind_of))
+        # How the pixel goes as the point goes ahead on the line, and to its left.
+        ahead, aside = by_step + by_conjugate, 1j * (by_step - by_conjugate)
+        speed = np.maximum(np.abs(ahead), 1e-9)
+        tangent = ahead / speed
+        turned = aside * tangent.conj()
         # The cut across the tape whose image is normal to the curve leans along the line.
-        speed2 = np.maximum(_dot(ahead, ahead), 1e-9)
-        lean = -_dot(aside, ahead) / speed2
+        lean = turned.real / -speed
+        gain = np.maximum(np.abs(turned.imag), 1e-9)
+        across = np.copysign(1.0, turned.imag) * 1j * tangent
+        bend = _dot(twice + 2.0 * mixed + conjugate_twice, across) / (speed * speed)
         half = self._half_width.take(number)
-        across = half * (aside + lean * ahead)
-        half_width = np.maximum(np.abs(across), 1e-12)
-        across /= half_width
-        bend = _dot(image.curvature(ahead_of), across) / speed2
+        cut = half * (lean + 1j)
+        square = cut * cut
         # The two edges lie unequally far from the midline: a matter of the second order.
-        centre = as_points(image.pixels + 0.5 * image.curvature(
-            half * (left_of + lean * ahead_of)))
+        centre = as_points(pixels + 0.5 * (
+            square * twice + 2.0 * np.abs(square) * mixed + square.conj() * conjugate_twice))
         # Near its ends the leaning cut would leave the tape.
         reach = half * np.abs(lean)
+        half_width = half * gain
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
                 & (distance < self._length.take(number) - reach))
-        bands = Bands(centre, as_points(image.pixels), as_points(across), bend, half_width,
+        bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number))
-        slide = self._slide(rotation, middle, image, across)
+        slide = np.empty((6, len(number))).T
+        # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
+        # along its line does not count.
+        np.multiply(-gain[:, None], self._left.take(number, axis=0), out=slide[:, :2])
+        np.multiply(-gain, (behind_of * middle).real, out=slide[:, 2])
+        # Floor that sinks by dz is seen where the ray would have met it, further out.
+        sinking = -gain * (behind_of * image.offset).imag * self._table.falls(image.radius)
+        slide[:, 3] = sinking
+        np.multiply(sinking, middle.imag, out=slide[:, 4])
+        np.multiply(-sinking, middle.real, out=slide[:, 5])
         if keep.all():
             return bands, slide
         return bands[keep], slide[keep]
 
-    def _slide(
-        self, rotation: Array, point: Array, image: FloorExpansion, across: Complex,
-    ) -> Array:
-        """Derivative of the stations' place across by pose and attitude (N, 6).
-
-        :param point: on the floor, in base_link (N, 2).
-        :param image: of the points.
-        :param across: unit normals of the curves (N,).
-        """
-        polar = np.empty(len(point), np.complex128)
-        polar.real, polar.imag = _dot(image.first[0], across), _dot(image.first[1], across)
-        gradient = as_points(image.outward * polar)
-        slide = np.empty((len(point), 6))
-        # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw.
-        slide[:, :2] = -gradient @ rotation.T
-        slide[:, 2] = gradient[:, 0] * point[:, 1] - gradient[:, 1] * point[:, 0]
-        # Floor that sinks by dz is seen where the ray would have met it, further out.
-        slide[:, 3] = -polar.real * self._table.falls(image.radius)
-        slide[:, 4] = slide[:, 3] * point[:, 1]
-        slide[:, 5] = -slide[:, 3] * point[:, 0]
-        return slide
+    def _in_base(self, pose: Pose2) -> tuple[Complex, Complex]:
+        """Starts and unit directions (L,) of the tapes in base_link, as x + iy."""
+        turn = complex(math.cos(pose.yaw), -math.sin(pose.yaw))
+        return (self._start - complex(pose.x, pose.y)) * turn, self._direction * turn
 
 
 def _leant(points: Array, attitude: Array) -> tuple[Array, Array]:

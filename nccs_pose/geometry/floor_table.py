@@ -30,7 +30,7 @@ from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates, spline_filter
+from scipy.ndimage import correlate1d, map_coordinates, spline_filter
 
 # The angle from the nadir varies almost linearly with the image radius, so a coarse grid in
 # (angle, azimuth) with cubic splines is enough.
@@ -38,28 +38,33 @@ _ANGLES = 64
 _AZIMUTHS = 128
 _PADDING = 8
 _STRIDE = 8
-# Weights of the four coefficients of a cubic spline about a point, for the value and two
-# derivatives, as polynomials in its place t between the second and the third; 1 to t^3 by rows.
+# Where the nadir, and straight ahead, are in the grid.
+_BEGIN = np.array([[_PADDING], [_PADDING + 0.5 * _AZIMUTHS]])
+# Weights of the four coefficients of a cubic spline about a point as polynomials in its place t
+# between the second and the third; 1 to t^3 by rows.
 _BASIS = np.array([
     [1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0],
     [-1.0, 3.0, -3.0, 1.0]]) / 6.0
-_BASES = np.hstack([
-    _BASIS,
-    np.vstack([_BASIS[1], 2.0 * _BASIS[2], 3.0 * _BASIS[3], np.zeros(4)]),
-    np.vstack([2.0 * _BASIS[2], 6.0 * _BASIS[3], np.zeros((2, 4))])])
+# The spline and its first two derivatives at a knot, by the coefficients about it.
+_AT_KNOT = np.array([[1.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [6.0, -12.0, 6.0]]) / 6.0
 
 
 Complex = NDArray[np.complex128]
 
 
-def _powers(t: Array) -> Array:
-    """1 to t^3 (..., 4)."""
-    powers = np.empty((*t.shape, 4))
-    powers[..., 0] = 1.0
-    powers[..., 1] = t
-    powers[..., 2] = t * t
-    powers[..., 3] = powers[..., 2] * t
-    return powers
+def _weights(t: Array) -> Array:
+    """Weights of the four coefficients about places (K,) between knots (4, K)."""
+    powers = np.empty((4, len(t)))
+    powers[0] = 1.0
+    powers[1] = t
+    np.multiply(t, t, out=powers[2])
+    np.multiply(powers[2], t, out=powers[3])
+    return _BASIS.T @ powers
+
+
+def _filtered(values: Complex) -> Complex:
+    """Spline coefficients of values on a grid."""
+    return np.asarray(spline_filter(values.real) + 1j * spline_filter(values.imag))
 
 
 def as_complex(vectors: Array) -> Complex:
@@ -76,35 +81,22 @@ def as_points(numbers: Complex) -> Array:
 class FloorExpansion:
     """Pixels of N ground points to second order in the points.
 
-    Pixels u + iv and directions of the floor x + iy are complex numbers. Derivatives are kept in
-    each point's own polar basis, away from the mirror's foot and round it.
+    Pixels u + iv and vectors of the floor x + iy, in base_link, are complex numbers. A point that
+    goes by d is seen at p + P d + Q d* + (U d^2 + 2 V |d|^2 + W d*^2) / 2, d* the conjugate.
 
-    :ivar pixels: (N,).
-    :ivar radius: of the points from the mirror's foot (N,), metres.
-    :ivar outward: unit vector away from the mirror's foot (N,), in base_link.
-    :ivar first: derivative of the pixels outward and round (2, N), px per metre.
-    :ivar second: outward twice, mixed, and round twice (3, N), px per square metre.
+    :ivar terms: p, P, Q, U, V and W by columns (N, 6); px, px per metre, px per square metre.
+    :ivar offset: of the points from the mirror's foot (N,), metres.
+    :ivar radius: its length (N,).
     """
 
-    pixels: Complex
+    terms: Complex
+    offset: Complex
     radius: Array
-    outward: Complex
-    first: Complex
-    second: Complex
 
-    def polar(self, direction: Complex) -> Complex:
-        """Components, outward + i round, of directions of base_link (N,)."""
-        return direction * self.outward.conj()
-
-    def slope(self, polar: Complex) -> Complex:
-        """First derivative of the pixels along directions in the polar basis (N,)."""
-        return polar.real * self.first[0] + polar.imag * self.first[1]
-
-    def curvature(self, polar: Complex) -> Complex:
-        """Second derivative of the pixels along directions in the polar basis (N,)."""
-        out, turned = polar.real, polar.imag
-        return (out * out * self.second[0] + 2.0 * out * turned * self.second[1]
-                + turned * turned * self.second[2])
+    @property
+    def pixels(self) -> Complex:
+        """Where the points themselves are seen (N,)."""
+        return self.terms[:, 0]
 
 
 class FloorTable:
@@ -127,10 +119,12 @@ class FloorTable:
             raise GeometryError(
                 f'the mirror at height {self.height} m does not stand over a floor')
         self._last_angle = math.atan2(1.02 * reach, self.height)
-        self._splines = self._forward()
-        rows, self._columns = self._splines[0].shape
+        self._foot = complex(*self.foot)
+        spline = self._forward()
+        rows, self._columns = spline.shape
         self._last_row = rows - 2.0 - 1e-9
-        self._knots = np.stack(self._splines, axis=-1).reshape(-1, 2)
+        self._knots = spline.view(np.float64).reshape(-1, 2)
+        self._terms = self._expansions(spline).view(np.float64).reshape(-1, 12)
         self._taps = (np.arange(-1, 3)[:, None] * self._columns + np.arange(-1, 3)).ravel()
         self._grid, self._grid_reaches = self._backward()
         self.region = self._region()
@@ -138,12 +132,12 @@ class FloorTable:
         self._sees_floor = np.pad(self.region > 0, 1)
         self._beyond = np.array([rig.camera.width, rig.camera.height], dtype=float)
 
-    def _forward(self) -> tuple[Array, Array]:
-        """Spline coefficients of u and v over (angle from the nadir, azimuth)."""
+    def _forward(self) -> Complex:
+        """Spline coefficients of the pixels over (angle from the nadir, azimuth from -pi)."""
         # Through the nadir the angle goes on negative, and the azimuth goes round: padding
         # keeps every point of use away from the grid's ends.
         angle = (np.arange(-_PADDING, _ANGLES + 1) / _ANGLES) * self._last_angle
-        azimuth = (np.arange(-_PADDING, _AZIMUTHS + _PADDING) / _AZIMUTHS) * 2.0 * np.pi
+        azimuth = (np.arange(-_PADDING, _AZIMUTHS + _PADDING) / _AZIMUTHS) * 2.0 * np.pi - np.pi
         radius = self.height * np.tan(angle)
         points = np.zeros((len(angle), len(azimuth), 3))
         points[..., 0] = self.foot[0] + radius[:, None] * np.cos(azimuth)
@@ -157,8 +151,9 @@ class FloorTable:
         seen = (visible & in_front).reshape(points.shape[:2])
         self._mirror_points, falls = self._rays(points, m, seen)
         # Outward, past the foot, and as good as the same all round.
-        self._outward = radius[_PADDING + 1:], np.einsum('rai,ai->r', falls[_PADDING + 1:], (
-            np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)))
+        past = radius[_PADDING + 1:]
+        outward = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)
+        self._outward = past, np.einsum('rai,ai->r', falls[_PADDING + 1:], outward) / past
         if not seen[_PADDING].any():
             raise GeometryError('the rig sees no floor: its nadir is not in the mirror')
         pixels = pixels.reshape(*points.shape[:2], 2)
@@ -172,7 +167,45 @@ class FloorTable:
         for _ in range(_PADDING):
             rows.append(4.0 * rows[-1] - 6.0 * rows[-2] + 4.0 * rows[-3] - rows[-4])
         padded = np.array(rows)
-        return spline_filter(padded[..., 0]), spline_filter(padded[..., 1])
+        return _filtered(padded[..., 0] + 1j * padded[..., 1])
+
+    def _expansions(self, spline: Complex) -> Complex:
+        """Spline coefficients of the terms of expansions (angles, azimuths, 6).
+
+        :param spline: of the pixels (angles, azimuths).
+        """
+        rows, columns = spline.shape
+        angle = ((np.arange(rows) - _PADDING) * (self._last_angle / _ANGLES))[:, None]
+        azimuth = (np.arange(columns) - _PADDING) * (2.0 * np.pi / _AZIMUTHS) - np.pi
+        by = (_ANGLES / self._last_angle, _AZIMUTHS / (2.0 * np.pi))
+
+        def partial(i: int, j: int) -> Complex:
+            """Derivative by the angle, so many times, and by the azimuth."""
+            along = correlate1d(spline, _AT_KNOT[i] * by[0]**i, axis=0, mode='nearest')
+            return np.asarray(
+                correlate1d(along, _AT_KNOT[j] * by[1]**j, axis=1, mode='nearest'))
+
+        # The angle's derivatives by the radius, and the radius' inverse, to the horizon and on.
+        by_radius = np.cos(angle) ** 2 / self.height
+        bend = -2.0 * np.sin(angle) * np.cos(angle) ** 3 / self.height**2
+        angle[_PADDING] = np.nan
+        inverse = 1.0 / (self.height * np.tan(angle))
+        out, turned = by_radius * partial(1, 0), inverse * partial(0, 1)
+        out_twice = by_radius**2 * partial(2, 0) + bend * partial(1, 0)
+        mixed = inverse * (by_radius * partial(1, 1) - turned)
+        turned_twice = inverse * (inverse * partial(0, 2) + out)
+        outward = np.exp(-1j * azimuth)
+        terms = np.stack([
+            spline, 0.5 * (out - 1j * turned) * outward, 0.5 * (out + 1j * turned) / outward,
+            0.25 * (out_twice - 2j * mixed - turned_twice) * outward**2,
+            0.25 * (out_twice + turned_twice),
+            0.25 * (out_twice + 2j * mixed - turned_twice) / outward**2])
+        # At the mirror's foot there is no direction outward: what is about it says how it goes on.
+        near, far = (terms[1:, _PADDING - k] + terms[1:, _PADDING + k] for k in (1, 2))
+        terms[1:, _PADDING] = (4.0 * near - far) / 6.0
+        for k in range(1, 6):
+            terms[k] = _filtered(terms[k])
+        return np.ascontiguousarray(terms.transpose(1, 2, 0))
 
     def _rays(
         self, points: Array, m: Array, seen: NDArray[np.bool_],
@@ -195,7 +228,7 @@ class FloorTable:
         return tuple(np.ascontiguousarray(mirror[..., k]) for k in range(3)), falls
 
     def falls(self, radius: Array) -> Array:
-        """How far outward over the floor a ray goes for each metre that it falls (N,).
+        """How far outward over the floor a ray goes as it falls by a metre, over the radius (N,).
 
         :param radius: where it meets the floor, from the mirror's foot (N,), metres.
         """
@@ -207,8 +240,8 @@ class FloorTable:
         :param points: (N, 2), metres.
         :param rise: how far they are over the floor, or under it (N,); small, metres.
         """
-        offset = points - self.foot
-        at = self._places(offset, np.sqrt(np.einsum('ni,ni->n', offset, offset)))
+        offset = as_complex(points) - self._foot
+        at = self._places(offset, np.abs(offset))
         x, y, z = (map_coordinates(component, at, order=1, mode='nearest')
                    for component in self._mirror_points)
         # The ray meets the floor a little further on, but comes from the same place.
@@ -218,63 +251,41 @@ class FloorTable:
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
-        offset = points - self.foot
-        within, around = self._cells(offset, np.sqrt(np.einsum('ni,ni->n', offset, offset)))
-        by_a, by_b = _powers(within) @ _BASIS
-        by_row = by_a[:, None] @ around.reshape(-1, 4, 8)
-        return (by_b[:, None] @ by_row.reshape(-1, 4, 2))[:, 0]
+        offset = as_complex(points) - self._foot
+        return self._read(self._knots, offset, np.abs(offset))
 
-    def _cells(self, offset: Array, radius: Array) -> tuple[Array, Array]:
-        """Places within the grid's cells (2, N) by angle and azimuth, and the cells' knots.
+    def expand(self, points: Array) -> FloorExpansion:
+        """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
+        offset = as_complex(points) - self._foot
+        radius = np.abs(offset)
+        return FloorExpansion(
+            self._read(self._terms, offset, radius).view(np.complex128), offset, radius)
 
-        :param offset: of floor points from the mirror's foot (N, 2), metres.
+    def _read(self, coefficients: Array, offset: Complex, radius: Array) -> Array:
+        """Values (N, K) of splines at floor points.
+
+        :param coefficients: by angle and azimuth, one knot after the other (M, K).
+        :param offset: of the points from the mirror's foot (N,), metres.
         :param radius: its length (N,).
-        :returns: the places, 0 to 1, and the coefficients around them (N, 16, 2), by angles first.
         """
         at = self._places(offset, radius)
         cell = at.astype(np.intp)
         first = cell[0] * self._columns + cell[1]
-        return at - cell, self._knots.take(first[:, None] + self._taps, axis=0)
+        at -= cell
+        by_one = _weights(at.ravel()).reshape(4, 2, -1)
+        weights = (by_one[:, None, 0] * by_one[None, :, 1]).reshape(16, -1).T
+        around = coefficients.take(first[:, None] + self._taps, axis=0)
+        return (weights[:, None] @ around)[:, 0]
 
-    def _places(self, offset: Array, radius: Array) -> Array:
-        """Places in the grid by angle and azimuth (2, N) of floor points; see :meth:`_cells`."""
+    def _places(self, offset: Complex, radius: Array) -> Array:
+        """Places in the grid by angle and azimuth (2, N) of floor points; see :meth:`_read`."""
         at = np.empty((2, len(offset)))
-        np.multiply(np.arctan2(radius, self.height), _ANGLES / self._last_angle, out=at[0])
-        np.multiply(np.arctan2(offset[:, 1], offset[:, 0]), _AZIMUTHS / (2.0 * np.pi), out=at[1])
-        # The azimuth goes from -pi to pi, and the grid from 0.
-        at[1] += _AZIMUTHS * (at[1] < 0.0)
-        at += _PADDING
+        np.multiply(np.arctan(radius / self.height), _ANGLES / self._last_angle, out=at[0])
+        np.multiply(
+            np.arctan2(offset.imag, offset.real), _AZIMUTHS / (2.0 * np.pi), out=at[1])
+        at += _BEGIN
         np.minimum(at[0], self._last_row, out=at[0])
         return at
-
-    def expand(self, points: Array) -> FloorExpansion:
-        """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
-        offset = points - self.foot
-        square = np.einsum('ni,ni->n', offset, offset)
-        radius = np.sqrt(square)
-        # At the foot itself there is no direction outward; nothing is seen there but the robot.
-        radius = np.maximum(radius, 1e-6)
-        step_a, step_b = self._last_angle / _ANGLES, 2.0 * np.pi / _AZIMUTHS
-        n = len(points)
-        within, around = self._cells(offset, radius)
-        basis_a, basis_b = (_powers(within) @ _BASES).reshape(2, n, 3, 4)
-        by_a = (basis_a @ around.reshape(n, 4, 8)).view(np.complex128)
-        # partial[j, i] is the j-th derivative by the azimuth and i-th by the angle, in knots.
-        partial = np.ascontiguousarray(
-            (by_a @ basis_b.transpose(0, 2, 1).astype(np.complex128)).transpose(2, 1, 0))
-        p_a, p_b = partial[0, 1] / step_a, partial[1, 0] / step_b
-        reach = square + self.height**2
-        by_radius, inverse = self.height / reach, 1.0 / radius
-        first = np.empty((2, n), np.complex128)
-        np.multiply(p_a, by_radius, out=first[0])
-        np.multiply(p_b, inverse, out=first[1])
-        second = np.empty((3, n), np.complex128)
-        second[0] = np.square(by_radius / step_a) * partial[0, 2] - (
-            2.0 * by_radius * radius / reach) * p_a
-        second[1] = (inverse * by_radius / (step_a * step_b)) * partial[1, 1] - inverse * first[1]
-        second[2] = np.square(inverse / step_b) * partial[2, 0] + inverse * first[0]
-        return FloorExpansion(
-            partial[0, 0], radius, as_complex(offset) * inverse, first, second)
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""

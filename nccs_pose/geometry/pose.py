@@ -33,6 +33,11 @@ def wrap_angle(angle: ArrayLike) -> Array:
     return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
+def _wrapped(angle: float) -> float:
+    """As wrap_angle, for one number."""
+    return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
+
+
 @dataclass(frozen=True)
 class Pose2:
     """A planar pose, the rigid motion (x, y, yaw): ``p_a = T_a_b.apply(p_b)``.
@@ -53,8 +58,7 @@ class Pose2:
             raise GeometryError(f'pose ({x}, {y}, {yaw}) is not finite')
         object.__setattr__(self, 'x', x)
         object.__setattr__(self, 'y', y)
-        # As wrap_angle, for one number.
-        object.__setattr__(self, 'yaw', -((-yaw + math.pi) % (2.0 * math.pi) - math.pi))
+        object.__setattr__(self, 'yaw', _wrapped(yaw))
 
     @classmethod
     def from_array(cls, array: Sequence[float] | Array) -> Pose2:
@@ -68,7 +72,8 @@ class Pose2:
 
     def minus(self, other: Pose2) -> Array:
         """Return (x, y, yaw) less another's as an array (3,), the difference of angles wrapped."""
-        return Pose2(self.x - other.x, self.y - other.y, self.yaw - other.yaw).as_array()
+        return np.array([
+            self.x - other.x, self.y - other.y, _wrapped(self.yaw - other.yaw)])
 
     @property
     def rotation(self) -> Array:
