@@ -80,6 +80,15 @@ def test_lines_of_any_colour_are_found_in_any_light(
     assert sum(found) >= 7, 'of ten; some images do not show enough'
 
 
+@pytest.mark.parametrize('light', ['neutral', 'warm'])
+@pytest.mark.parametrize(('colours', 'floor'), [(('green',) * 4, 'green'), (MIXED, 'grey')])
+def test_tapes_of_nearly_the_floors_colour_are_found_where_there_is_light(
+        colours: tuple[str, ...], floor: str, light: str) -> None:
+    scene = _scene(colours, floor, light)
+    localiser = Localiser(scene.rig, scene.line_map)
+    assert sum(_found(localiser, scene, k) for k in range(10)) >= 9
+
+
 @pytest.mark.parametrize('light', ['dim', 'bright', 'warm', 'cold'])
 def test_light_that_changes_between_two_images_does_not_lose_the_lines(light: str) -> None:
     before, after = _scene(MIXED, 'green', 'neutral'), _scene(MIXED, 'green', light)
