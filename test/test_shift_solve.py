@@ -22,6 +22,7 @@ import math
 from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.shift_solve import solve_shifts
 from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.scene import arena_map, arena_rig
@@ -101,6 +102,31 @@ def test_stations_are_predicted_under_a_base_that_leans_and_has_risen(degrees: f
     assert moved.max() > 3.0 * degrees
     # What many stations tell together is ten times finer than a hundredth of a pixel.
     assert off.max() < 0.003
+
+
+def test_no_station_stands_where_another_tape_is_beside_it() -> None:
+    # Two tapes that run together, and one that crosses one of them.
+    close = LineMap(tuple(
+        Line(np.array([*start, 0.0]), np.array([*end, 0.0]), 0.05)
+        for start, end in [((1.5, -1.0), (1.7, 1.3)), ((1.4, -1.0), (1.45, 0.3)),
+                           ((0.9, 0.8), (2.1, 0.9))]))
+    predictor = BandPredictor(FloorTable(RIG, 5.0), close)
+    places = predictor.places(POSE, 2.0, 150)
+    bands, _ = predictor.bands(places, POSE)
+    nearest = np.full(len(bands), np.inf)
+    for k, other in enumerate(close):
+        along = np.linspace(0.0, other.length, 2000)[:, None]
+        left = 0.5 * other.width * np.array([-other.direction[1], other.direction[0], 0.0])
+        edges = np.concatenate([
+            other.start + along * other.direction + side * left for side in (-1.0, 1.0)])
+        pixels, seen = RIG.project(POSE.inverse().apply(edges))
+        distance = np.linalg.norm(bands.midline[:, None] - pixels[seen], axis=2).min(axis=1)
+        nearest = np.where(bands.label == k, nearest, np.minimum(
+            nearest, distance - bands.half_width))
+    assert (np.bincount(bands.label, minlength=3) > 10).all()
+    assert len(bands) < len(places) - 10
+    # Of the 4 px some are lost where the other tape lies ahead: along a tape the image is finer.
+    assert nearest.min() > 2.5
 
 
 def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> None:

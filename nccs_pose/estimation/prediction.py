@@ -37,6 +37,10 @@ _COARSE = 32
 _SLOPE = 1e-9
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
+# Floor that a profile needs beside its tape, px: nearer to another tape it would show both.
+_BESIDE = 4.0
+# So finely is known how near other tapes come, parts of a tape's length.
+_GAPS = 256
 # So many stations at most, on all lines together.
 _MOST = 1500
 _LEVEL = np.zeros(3)
@@ -81,6 +85,7 @@ class BandPredictor:
         self._half_width = 0.5 * line_map.widths[self._lines]
         self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
         self._slope = _SLOPE * np.arange(self._distance.size)
+        self._gap = self._gaps().ravel()
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
@@ -161,8 +166,11 @@ class BandPredictor:
         # Near its ends the leaning cut would leave the tape.
         reach = half * np.abs(lean)
         half_width = half * gain
-        keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (distance > reach)
-                & (distance < self._length.take(number) - reach))
+        length = self._length.take(number)
+        gap = self._gap.take(
+            number * _GAPS + (distance * (_GAPS / length)).astype(np.intp), mode='clip')
+        keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
+                & (distance > reach) & (distance < length - reach))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number))
         slide = np.empty((6, len(number))).T
@@ -178,6 +186,17 @@ class BandPredictor:
         if keep.all():
             return bands, slide
         return bands[keep], slide[keep]
+
+    def _gaps(self) -> Array:
+        """Floor between a tape's edge and the next tape (L, G), metres, along each tape."""
+        along = np.arange(0.5, _GAPS) / _GAPS
+        points = self._start[:, None] + along * (self._length * self._direction)[:, None]
+        # In the frame of each tape: (L, L, G), the other tape first.
+        seen = (points - self._start[:, None, None]) * self._direction.conj()[:, None, None]
+        beyond = seen.real - np.clip(seen.real, 0.0, self._length[:, None, None])
+        gap = np.hypot(beyond, seen.imag) - self._half_width[:, None, None]
+        gap[np.diag_indices(len(gap))] = np.inf
+        return gap.min(axis=0, initial=np.inf) - self._half_width[:, None]
 
     def _in_base(self, pose: Pose2) -> tuple[Complex, Complex]:
         """Starts and unit directions (L,) of the tapes in base_link, as x + iy."""
