@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 
 # Stations farther apart than this many share little; their products would only add noise.
 _LAGS = 2
+# What the factor's own uncertainty weighs: one unknown in theory where errors are independent,
+# more where they are not; found on simulated images (as was the exponential).
+_UNCERTAIN = 2
 # From few stations the correlation is not known; the claim is widened or narrowed no further.
 _LIMIT = 1.2
 # So many neighbours may share one cause of misfit (a block of JPEG, a tile).
@@ -43,8 +46,8 @@ def correlation_factor(residual: Array, label: NDArray[np.intp], unknowns: int) 
     it. On simulated images of all kinds the squared errors of poses were what it says, to a tenth.
 
     What the fit takes out of the residuals is what they have in common: each unknown, one in N of
-    their variance times this factor, from every c_k alike. One unknown more stands for the
-    uncertainty of the factor itself, which makes the inverse of a covariance too large on average.
+    their variance times this factor, from every c_k alike. A few more stand for the uncertainty
+    of the factor itself, which makes the inverse of a covariance too large on average.
 
     :param residual: of the stations (N,), whitened, along each line in order.
     :param label: line (N,), ascending.
@@ -57,7 +60,7 @@ def correlation_factor(residual: Array, label: NDArray[np.intp], unknowns: int) 
         along = label[lag:] == label[:-lag]
         products = float((residual[lag:] * residual[:-lag]) @ along)
         correlation += products / max(1, int(np.count_nonzero(along))) / variance
-    taken = _LAGS * (unknowns + 1) / max(1, len(residual))
+    taken = _LAGS * (unknowns + _UNCERTAIN) / max(1, len(residual))
     exponent = correlation
     for _ in range(2):
         exponent = min(correlation + taken * math.exp(2.0 * exponent), _LIMIT)
