@@ -35,48 +35,50 @@ _SIDES = np.array([1.0, -1.0], np.float32)[:, None, None]
 
 
 def read_pixels(
-    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
+    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int, density: float,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """The pixels nearest to a grid over each band: values (N, P, 3) and place across s (N, P), px.
 
     :param margin: beyond the edges, px.
     :param rows: of the grid along each station's piece of curve.
+    :param density: of the grid across, per px, or more.
     """
     # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
     # across for its real part and the one along (backwards) for its imaginary part.
-    centre = as_complex(bands.centre)
-    across = as_complex(bands.across)[:, None]
-    bend = (0.5 * bands.bend).astype(np.float32)[:, None]
-    half_band = (bands.half_width + margin).astype(np.float32)
-    k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    t = bands.spacing.astype(np.float32)[:, None] * _middles(rows)
+    centre, across = as_complex(bands.centre), as_complex(bands.across)
+    half_band = bands.half_width + margin
+    k = min(math.ceil(2.0 * density * float(half_band.max())) + 1, _MOST_ACROSS)
+    bend = 0.5 * bands.bend
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
-    on_curve = (bend * t * t - 1j * t) * across
-    arm = (half_band[:, None] * _between(k)) * across
-    at = (on_curve + centre[:, None])[:, :, None] + arm[:, None, :]
+    terms = np.empty((len(bands), 4), np.complex64)
+    terms[:, 0] = centre
+    terms[:, 1] = half_band * across
+    terms[:, 2] = -1j * bands.spacing * across
+    terms[:, 3] = bend * np.square(bands.spacing) * across
+    at = terms @ _grid(rows, k)
     pixels = at.view(np.float32)
     np.rint(pixels, out=pixels)
-    n = len(bands)
-    values = cv2.remap(image, pixels.reshape(n, rows * k, 2), None, cv2.INTER_NEAREST,
+    values = cv2.remap(image, pixels.reshape(*at.shape, 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
-    at = at.reshape(n, rows * k)
     at -= centre[:, None]
-    at *= across.conj()
+    at *= across.conj()[:, None]
     s = np.square(at.imag)
-    s *= bend
+    s *= bend.astype(np.float32)[:, None]
     return values, np.subtract(at.real, s, out=s)
 
 
 @cache
-def _middles(count: int) -> NDArray[np.float32]:
-    """The middles of so many equal parts of what reaches from -1/2 to 1/2."""
-    return ((np.arange(count) + 0.5) / count - 0.5).astype(np.float32)
+def _grid(rows: int, count: int) -> NDArray[np.complex64]:
+    """1, places across from -1 to 1, along from -1/2 to 1/2, and their squares (4, rows x count).
 
-
-@cache
-def _between(count: int) -> NDArray[np.float32]:
-    """So many places from -1 to 1."""
-    return np.linspace(-1.0, 1.0, count, dtype=np.float32)
+    :param rows: of places along, in the middles of equal parts.
+    :param count: of places across.
+    """
+    along, across = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows - 0.5, np.linspace(-1.0, 1.0, count), indexing='ij')
+    return np.stack([
+        np.ones(rows * count), across.ravel(), along.ravel(), np.square(along.ravel()),
+    ]).astype(np.complex64)
 
 
 def as_complex(points: Array) -> NDArray[np.complex64]:
