@@ -48,9 +48,11 @@ class Bands:
         return len(self.label)
 
     def __getitem__(self, index: NDArray[np.bool_]) -> Bands:
+        at = index.nonzero()[0]
         return Bands(
-            self.centre[index], self.midline[index], self.across[index], self.bend[index],
-            self.half_width[index], self.spacing[index], self.label[index])
+            self.centre.take(at, axis=0), self.midline.take(at, axis=0),
+            self.across.take(at, axis=0), self.bend.take(at), self.half_width.take(at),
+            self.spacing.take(at), self.label.take(at))
 
 
 def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
