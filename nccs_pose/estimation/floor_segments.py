@@ -40,6 +40,8 @@ from numpy.typing import NDArray
 _LEAST_PIXELS = 10
 # Of a large blob only some pixels are looked at; a few of them in a row are no line yet.
 _LEAST_SAMPLES = 8
+# Fewer than this to start from hardly ever grow to so many.
+_LEAST_START = 4
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
@@ -126,7 +128,7 @@ def floor_segments(
         support[best] = -np.inf
         start = np.flatnonzero((near[:, best] > 0.0) & free)
         # Many lines through one small thing start from the very same points.
-        if start.tobytes() in futile:
+        if len(start) < _LEAST_START or start.tobytes() in futile:
             continue
         found = _strip(points, free, start, width)
         if found is None:
@@ -218,8 +220,9 @@ def _strip(
         line = FloorLine.through(points.moments[inside].sum(axis=0))
         along, beyond = line.places(points, width)
         before = inside
-        inside = _longest_run(
-            points, along, np.flatnonzero((beyond < 0.0) & free), _LONGEST_GAP)
+        inside = np.flatnonzero((beyond < 0.0) & free)
+        if len(inside) >= _LEAST_SAMPLES:
+            inside = _longest_run(points, along, inside, _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
         if np.array_equal(inside, before):
@@ -257,6 +260,6 @@ def _longest_run(
     gaps = np.flatnonzero(run[1:] - run[:-1] > longest_gap) + 1
     if len(gaps) == 0:
         return inside
-    bounds = np.concatenate([[0], gaps])
-    heaviest = int(np.add.reduceat(points.weight[order], bounds).argmax())
-    return np.sort(np.split(order, gaps)[heaviest])
+    bounds = [0, *gaps.tolist(), len(order)]
+    heaviest = int(np.add.reduceat(points.weight[order], bounds[:-1]).argmax())
+    return np.sort(order[bounds[heaviest]:bounds[heaviest + 1]])
