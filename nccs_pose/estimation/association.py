@@ -85,6 +85,8 @@ class Associator:
             return ()
         scorer = self._scorer(segments)
         poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _SEEDS))
+        if len(poses.place) == 0:
+            return ()
         if len(poses.place) > _CLOSE:
             poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_CLOSE]]
         if len(poses.place) > _REFINED:

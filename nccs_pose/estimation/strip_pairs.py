@@ -64,18 +64,17 @@ class StripLines:
     """Strips in base_link, their points complex numbers x + iy.
 
     :ivar start: one end (S,), metres.
-    :ivar direction: unit (S,), along each, either way.
+    :ivar direction: unit (S,), from there to the other end.
     :ivar length: metres (S,).
     :ivar middle: between both ends (S,), metres.
     :ivar colour: colour class of each.
     """
 
     def __init__(self, segments: tuple[FloorSegment, ...]) -> None:
-        ends = np.array([(s.start, s.end) for s in segments]).reshape(-1, 4).view(np.complex128)
-        self.start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
-        self.length = np.abs(along)
-        self.direction = along / self.length
-        self.middle = self.start + 0.5 * along
+        start, end, left = np.array([(s.start, s.end, s.normal) for s in segments]).reshape(
+            -1, 6).view(np.complex128).T
+        self.start, self.length, self.direction = start, np.abs(end - start), -1j * left
+        self.middle = 0.5 * (start + end)
         self.colour = tuple(s.colour for s in segments)
 
     def fits(self, lines: FloorLines) -> NDArray[np.bool_]:
