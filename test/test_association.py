@@ -20,14 +20,16 @@ from dataclasses import replace
 import itertools
 
 from nccs_pose.estimation.association import (
-    global_candidates,
+    Associator,
     map_symmetries,
     same_pose,
-    score_pose,
 )
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
+from nccs_pose.estimation.nearest_lines import NearestLines
+from nccs_pose.estimation.strip_pairs import FloorLines
 from nccs_pose.files.yaml_files import load_map
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.floor_scale import FloorScale
+from nccs_pose.geometry.floor_table import as_points, FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 from nccs_pose.simulation.renderer import render
@@ -123,7 +125,7 @@ def test_the_pose_is_among_the_candidates_on_any_map(n: int, table: FloorTable) 
         if len(strips) < 2 or not _cross(strips):
             continue
         tried += 1
-        candidates = global_candidates(strips, line_map, table)
+        candidates = Associator(line_map, table).candidates(strips)
         assert all(a.score >= b.score for a, b in itertools.pairwise(candidates))
         right = [c for c in candidates if _near(c.pose, pose)]
         if not right:
@@ -148,11 +150,11 @@ def test_every_pose_on_a_soccer_field_is_found(repository, table: FloorTable) ->
         if len(strips) < 5 or not _cross(strips):
             continue
         tried += 1
-        candidates = global_candidates(strips, field, table)
+        candidates = Associator(field, table).candidates(strips)
         best = candidates[0].score
         equal = [c.pose for c in candidates if c.score > best - 0.05]
         assert any(_near(s @ pose, other) for s in symmetries for other in equal)
-        explains, _ = score_pose(pose, strips, field, table)
+        explains, _ = Associator(field, table).score(pose, strips)
         assert explains > best - 0.05
 
 
@@ -163,7 +165,7 @@ def test_a_symmetric_map_gives_all_its_equal_poses(
     rng = np.random.default_rng(9)
     for _ in range(5):
         pose = Pose2(*rng.uniform(-0.9, 0.9, 2), rng.uniform(-np.pi, np.pi))
-        candidates = global_candidates(_strips(line_map, pose, rng, 0.002), line_map, table)
+        candidates = Associator(line_map, table).candidates(_strips(line_map, pose, rng, 0.002))
         best = candidates[0].score
         assert best > 0.9
         equal = [c.pose for c in candidates if c.score > 0.9 * best]
@@ -180,10 +182,10 @@ def test_one_strip_and_parallel_strips_give_no_pose(table: FloorTable) -> None:
     parallel = tuple(
         s for s, a in zip(strips, angles) if abs(np.sin(a - angles[0])) < 0.1)
     assert len(parallel) == 2
-    assert global_candidates(parallel, line_map, table) == ()
-    assert global_candidates(strips[:1], line_map, table) == ()
-    assert global_candidates((), line_map, table) == ()
-    assert score_pose(Pose2(0.0, 0.0, 0.0), (), line_map, table) == (0.0, 0.0)
+    assert Associator(line_map, table).candidates(parallel) == ()
+    assert Associator(line_map, table).candidates(strips[:1]) == ()
+    assert Associator(line_map, table).candidates(()) == ()
+    assert Associator(line_map, table).score(Pose2(0.0, 0.0, 0.0), ()) == (0.0, 0.0)
 
 
 def test_strips_that_are_no_lines_do_not_hide_the_pose(table: FloorTable) -> None:
@@ -201,16 +203,16 @@ def test_strips_that_are_no_lines_do_not_hide_the_pose(table: FloorTable) -> Non
             normal, float(normal @ start), start, start + 0.6 * along, 40.0, 0.01,
             np.zeros((0, 2))))
     mixed = tuple(sorted((*strips, *false), key=lambda s: -s.weight))
-    candidates = global_candidates(mixed, line_map, table)
+    candidates = Associator(line_map, table).candidates(mixed)
     assert _near(candidates[0].pose, pose)
-    assert candidates[0].score < global_candidates(strips, line_map, table)[0].score
+    assert candidates[0].score < Associator(line_map, table).candidates(strips)[0].score
 
 
 def test_colours_tell_equal_lines_apart(table: FloorTable) -> None:
     square = _rectangle(4.0, 4.0)
     coloured = LineMap((replace(square[0], colour='yellow'), *square[1:]))
     pose, rng = Pose2(0.4, -0.2, 2.0), np.random.default_rng(13)
-    candidates = global_candidates(_strips(coloured, pose, rng, 0.002), coloured, table)
+    candidates = Associator(coloured, table).candidates(_strips(coloured, pose, rng, 0.002))
     assert _near(candidates[0].pose, pose)
     assert len(candidates) == 1 or candidates[1].score < 0.85 * candidates[0].score
 
@@ -219,11 +221,11 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
     line_map = _random_map(np.random.default_rng(14), 6)
     pose = Pose2(0.1, 0.2, -0.7)
     strips = _strips(line_map, pose, np.random.default_rng(15))
-    there, claimed = score_pose(pose, strips, line_map, table)
+    there, claimed = Associator(line_map, table).score(pose, strips)
     assert there > 0.9
     assert claimed == pytest.approx(1.0)
     for step in (Pose2(0.5, 0.0, 0.0), Pose2(0.0, -0.6, 0.0), Pose2(0.0, 0.0, 0.5)):
-        score, part = score_pose(pose @ step, strips, line_map, table)
+        score, part = Associator(line_map, table).score(pose @ step, strips)
         assert score < there - 0.3
         assert part < claimed
 
@@ -237,7 +239,7 @@ def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -
     assert len(strips) == 3
     # Pixels of strips that are each two of the image wide.
     strips = tuple(replace(strip, pitch=2) for strip in strips)
-    best = global_candidates(strips, line_map, table)[0]
+    best = Associator(line_map, table).candidates(strips)[0]
     square, weight = 0.0, 0.0
     for strip in strips:
         share = (np.arange(12) + 0.5)[:, None] / 12
@@ -250,7 +252,49 @@ def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -
     assert best.misfit > 0.1
     assert best.misfit == pytest.approx(np.sqrt(square / weight), rel=1e-6)
     exact = _strips(line_map, pose, np.random.default_rng(16), noise=0.0)
-    assert global_candidates(exact, line_map, table)[0].misfit < 1e-3
+    assert Associator(line_map, table).candidates(exact)[0].misfit < 1e-3
+
+
+def test_the_nearest_line_is_that_of_an_exhaustive_search() -> None:
+    rng = np.random.default_rng(17)
+    line_map = LineMap(tuple(
+        replace(line, colour=('green', 'red')[k % 3 == 0])
+        for k, line in enumerate(_random_map(rng, 12))))
+    lines = FloorLines(line_map)
+    nearest = NearestLines(lines)
+    points = rng.uniform(-7.0, 7.0, 4000) + 1j * rng.uniform(-7.0, 7.0, 4000)
+    for colour in ('green', 'red'):
+        which, across = nearest.at(points[None], np.repeat(nearest.layers((colour,)), len(points)))
+        # How far the exhaustive search takes a line to go on, less or more than it does.
+        distances = []
+        for beyond in (0.15, 0.25):
+            off = (points[:, None] - lines.start) * lines.direction.conj()
+            beside = (off.real > -beyond) & (off.real < lines.length + beyond)
+            beside &= np.array(lines.colour) == colour
+            distances.append(np.where(beside, np.abs(off.imag), np.inf).min(axis=1))
+        known = (distances[0] == distances[1]) & (distances[0] < 0.95)
+        assert known.sum() > 250
+        np.testing.assert_allclose(np.abs(across[0, known]), distances[0][known], atol=1e-12)
+        assert (np.array(lines.colour)[which[0, known]] == colour).all()
+        assert np.isinf(across[0, distances[1] > 1.1]).all()
+        assert (which[0, distances[1] > 1.1] == len(line_map)).all()
+
+
+def test_steps_on_the_floor_are_as_long_in_the_image_as_they_are_seen(table: FloorTable) -> None:
+    rng = np.random.default_rng(18)
+    radius, angle = rng.uniform(0.6, REACH - 0.1, 2000), rng.uniform(-np.pi, np.pi, 2000)
+    scale = FloorScale(table)
+    points = scale.foot + radius * np.exp(1j * angle)
+    step = 0.02 * np.exp(1j * rng.uniform(-np.pi, np.pi, 2000))
+    ends = [table.pixels(as_points(points + way * step)) for way in (-0.5, 0.5)]
+    exact = np.linalg.norm(ends[1] - ends[0], axis=1)
+    seen = table.sees_floor(0.5 * (ends[0] + ends[1]))
+    told = scale.pixels(points, step)
+    both = seen & (told > 0.0)
+    # The cells at the border of what is seen may be in or out.
+    assert np.count_nonzero(seen != (told > 0.0)) < 0.05 * len(points)
+    assert np.median(np.abs(told[both] / exact[both] - 1.0)) < 0.05
+    assert np.abs(told[both] / exact[both] - 1.0).max() < 0.3
 
 
 # ---------------------------------------------------------------- symmetries of maps

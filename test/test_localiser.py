@@ -28,7 +28,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
 from nccs_pose.simulation.renderer import render
-from nccs_pose.simulation.scene import ideal_scene, Scene
+from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 import numpy as np
 import pytest
 
@@ -209,6 +209,28 @@ def test_driving_on_decides_between_equal_poses() -> None:
             assert drive.right(answers[-1])
     assert answers[0].pose is None
     assert answers[-1].state is State.TRACKING
+
+
+def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
+    """Bays along two walls of a hall: far more places look alike than are looked at closely."""
+    bays = [_line((x, y), (x, y + 2.0)) for x in np.arange(-13.8, 14.0, 1.2) for y in (0.0, 3.0)]
+    hall = LineMap((_line((-14.4, 0.0), (14.4, 0.0)), _line((-14.4, 5.0), (14.4, 5.0)), *bays))
+    assert len(hall) == 50
+    look = replace(arena_scene(640).appearance, room=None, obstacles=())
+    scene = replace(arena_scene(640), line_map=hall, appearance=look)
+    localiser = Localiser(scene.rig, hall)
+    rng = np.random.default_rng(3)
+    states = []
+    for k in range(12):
+        # Not so near the ends of the hall that they can be seen.
+        pose = Pose2(rng.uniform(-8.0, 8.0), rng.uniform(0.5, 4.5), rng.uniform(-np.pi, np.pi))
+        localiser.relocalise()
+        estimate = localiser.process((k + 1) * PERIOD_NS, render(scene, pose, rng))
+        states.append(estimate.state)
+        assert estimate.pose is None
+        if estimate.state is State.AMBIGUOUS:
+            assert len(estimate.candidates) >= 5
+    assert states.count(State.AMBIGUOUS) >= 8
 
 
 # ---------------------------------------------------------------- kidnapping

@@ -26,23 +26,26 @@ import math
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.estimation.nearest_lines import NearestLines
+from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs, StripLines
+from nccs_pose.geometry.floor_scale import FloorScale
+from nccs_pose.geometry.floor_table import Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
 import numpy as np
 from numpy.typing import NDArray
 
-# Strips that start hypotheses, and hypotheses that are looked at closely.
+# Strips that start hypotheses; of these so many are looked at closely, by every third sample of
+# the strips, and so many are refined.
 _SEEDS = 6
 _CLOSE = 200
-# Above this number every fourth sample tells which hypotheses are worth a closer look.
-_MANY = 400
-_COARSE = 4
+_COARSE = 3
 _REFINED = 24
 _ROUNDS = 2
-# Samples on each strip and on each map line.
+# Samples on each strip and on what is near of each map line.
 _SAMPLES = 12
+# No sample of a line counts for more than this, px of the image.
+_LONGEST_SAMPLE = 60.0
 # Fewer samples than this on lines refine no pose.
 _LEAST_SAMPLES = 4
 # Tapes whose ends are this close look the same, metres.
@@ -62,43 +65,58 @@ class FittedCandidate(Candidate):
     misfit: float
 
 
-def global_candidates(
-    segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable, most: int = 8,
-) -> tuple[FittedCandidate, ...]:
-    """Poses that explain the strips, best first; none where fewer than two strips cross.
+class Associator:
+    """Finds and scores poses by the strips of an image, on one rig and map.
 
-    A candidate's score is the harmonic mean of two fractions: of the strips' pixels that lie on
-    map lines, and of the map lines in view that strips lie on.
+    A pose's score is the harmonic mean of two fractions: of the strips' pixels that lie on map
+    lines, and of the map lines in view that strips lie on.
     """
-    lines = FloorLines.of(line_map)
-    poses = poses_of_pairs(segments[:_SEEDS], lines)
-    if len(poses) == 0:
-        return ()
-    scorer = _Scorer(segments, lines, table)
-    if len(poses) > _MANY:
-        poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_MANY]]
-    if len(poses) > _REFINED:
-        poses = poses[np.argsort(-scorer.claimed(poses), kind='stable')[:_CLOSE]]
-        poses = poses[np.argsort(-scorer.score(poses), kind='stable')[:_REFINED]]
-    refined = scorer.refine(poses)
-    claimed, misfit = scorer.fit(refined)
-    return _distinct(refined, _harmonic(claimed, scorer.explained(refined)), misfit, most)
 
+    def __init__(self, line_map: LineMap, table: FloorTable) -> None:
+        lines = FloorLines(line_map)
+        self._place = _Place(lines, NearestLines(lines), FloorScale(table))
+        self._last: _Scorer | None = None
 
-def score_pose(
-    pose: Pose2, segments: tuple[FloorSegment, ...], line_map: LineMap, table: FloorTable,
-) -> tuple[float, float]:
-    """The score that :func:`global_candidates` would give a pose, and the strips' part in it.
+    def candidates(
+        self, segments: tuple[FloorSegment, ...], most: int = 8,
+    ) -> tuple[FittedCandidate, ...]:
+        """Poses that explain strips, best first; none where fewer than two strips cross."""
+        if len(segments) < 2:
+            return ()
+        scorer = self._scorer(segments)
+        poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _SEEDS))
+        if len(poses.place) == 0:
+            return ()
+        if len(poses.place) > _CLOSE:
+            poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_CLOSE]]
+        if len(poses.place) > _REFINED:
+            poses = poses[_distinct(poses, scorer.score(poses, _COARSE), _REFINED)]
+        poses = scorer.refined(poses)
+        claimed, misfit = scorer.fit(poses)
+        score = _harmonic(claimed, scorer.explained(poses))
+        return tuple(
+            FittedCandidate(poses.pose(k), float(score[k]), float(misfit[k]))
+            for k in _distinct(poses, score, most))
 
-    :returns: the score, 0 to 1, and the fraction of the strips' pixels that lie on map lines;
-        both 0 where there are no strips.
-    """
-    if not segments:
-        return 0.0, 0.0
-    scorer = _Scorer(segments, FloorLines.of(line_map), table)
-    at = pose.as_array()[None]
-    claimed = scorer.claimed(at)
-    return float(_harmonic(claimed, scorer.explained(at))[0]), float(claimed[0])
+    def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
+        """The score that a pose would have among the candidates, and the strips' part in it.
+
+        :returns: the score, 0 to 1, and the fraction of the strips' pixels that lie on map lines;
+            both 0 where there are no strips.
+        """
+        if not segments:
+            return 0.0, 0.0
+        scorer = self._scorer(segments)
+        at = _Poses(np.array([complex(math.cos(pose.yaw), math.sin(pose.yaw))]),
+                    np.array([complex(pose.x, pose.y)]))
+        claimed = scorer.claimed(at)
+        return float(_harmonic(claimed, scorer.explained(at))[0]), float(claimed[0])
+
+    def _scorer(self, segments: tuple[FloorSegment, ...]) -> _Scorer:
+        """Of the strips, which are most often those that were last asked about."""
+        if self._last is None or self._last.segments is not segments:
+            self._last = _Scorer(segments, self._place)
+        return self._last
 
 
 def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
@@ -131,125 +149,132 @@ def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
     return tuple(found)
 
 
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A map, and how the rig sees its floor."""
+
+    lines: FloorLines
+    nearest: NearestLines
+    scale: FloorScale
+
+
+@dataclass(frozen=True, eq=False)
+class _Poses:
+    """H poses T_map_base: rotations, unit complex numbers (H,), and places x + iy (H,), metres."""
+
+    rotation: Complex
+    place: Complex
+
+    def __getitem__(self, index: NDArray[np.intp] | list[int]) -> _Poses:
+        return _Poses(self.rotation[index], self.place[index])
+
+    def pose(self, index: int) -> Pose2:
+        """One of them."""
+        place, rotation = complex(self.place[index]), complex(self.rotation[index])
+        return Pose2(place.real, place.imag, math.atan2(rotation.imag, rotation.real))
+
+
 class _Scorer:
     """How well poses explain the strips of one image."""
 
-    def __init__(
-        self, segments: tuple[FloorSegment, ...], lines: FloorLines, table: FloorTable,
-    ) -> None:
-        self._lines = lines
-        self._table = table
-        # A strip of one colour lies on no line of another.
-        self._foreign = np.array([
-            np.repeat([s.colour != colour for s in segments], _SAMPLES)
-            for colour in lines.colour])
+    def __init__(self, segments: tuple[FloorSegment, ...], place: _Place) -> None:
+        self.segments = segments
+        self.strips = strips = StripLines(segments)
+        self._lines, self._nearest, self._scale = place.lines, place.nearest, place.scale
+        footprint, weight, pitch = np.array(
+            [(s.footprint, s.weight, s.pitch) for s in segments]).T
         share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-        starts = np.array([s.start for s in segments])
-        ends = np.array([s.end for s in segments])
-        self._points = (starts[:, None] + share[:, None] * (ends - starts)[:, None]).reshape(-1, 2)
-        self._weight = np.repeat([s.weight / _SAMPLES for s in segments], _SAMPLES)
-        self._tolerance = np.repeat([0.06 + 1.5 * s.footprint for s in segments], _SAMPLES)
-        self._pixels_per_metre = np.repeat(
-            [s.pitch / max(s.footprint, 1e-9) for s in segments], _SAMPLES)
-        length = np.hypot(*(ends - starts).T)
-        self._spans = list(zip(
-            starts.tolist(), ((ends - starts) / length[:, None]).tolist(), length.tolist(),
-            [0.06 + 1.5 * s.footprint for s in segments]))
-        self._map_points = (
-            lines.start[:, None]
-            + (share * lines.length[:, None])[..., None] * lines.direction[:, None]
-        ).reshape(-1, 2)
-        # Each sample's neighbours on its line.
-        index = np.arange(_SAMPLES)
-        self._before = np.maximum(index - 1, 0)
-        self._after = np.minimum(index + 1, _SAMPLES - 1)
-        self._between = self._after - self._before
+        self._share = share
+        self._points = (strips.start[:, None] + (
+            strips.length * strips.direction)[:, None] * share).ravel()
+        self._weight = np.repeat(weight / weight.sum() / _SAMPLES, _SAMPLES)
+        tolerance = 0.06 + 1.5 * footprint
+        self._tolerance = np.repeat(tolerance, _SAMPLES)
+        self._pixels_per_metre = np.repeat(pitch / np.maximum(footprint, 1e-9), _SAMPLES)
+        self._layer = np.repeat(place.nearest.layers(strips.colour), _SAMPLES)
+        # Where a point x, y, 1 is along each strip and across it, within 1 if it lies in it.
+        frames = np.stack([strips.direction / (0.5 * strips.length + BEYOND),
+                           1j * strips.direction / tolerance], axis=1).ravel()
+        middle = np.repeat(strips.middle, 2)
+        self._frames = np.stack([frames.real, frames.imag, -(frames * middle.conj()).real])
 
     def _on_lines(
-        self, poses: Array, step: int = 1,
+        self, poses: _Poses, step: int = 1,
     ) -> tuple[NDArray[np.bool_], NDArray[np.intp], Array]:
         """Whether each sample (H, P) lies on a map line, which one, and how far off it.
 
         :param step: look at one sample out of so many.
         """
-        points = self._points[step // 2::step]
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        x = c[:, None] * points[:, 0] - s[:, None] * points[:, 1] + poses[:, :1]
-        y = s[:, None] * points[:, 0] + c[:, None] * points[:, 1] + poses[:, 1:2]
-        lines = self._lines
-        best = np.full(x.shape, np.inf)
-        which = np.zeros(x.shape, dtype=np.intp)
-        # One line at a time keeps the arrays small where maps are large.
-        for k in range(len(lines.length)):
-            across = lines.normal[k, 0] * x + lines.normal[k, 1] * y - lines.offset[k]
-            along = (lines.direction[k, 0] * (x - lines.start[k, 0])
-                     + lines.direction[k, 1] * (y - lines.start[k, 1]))
-            outside = ((along < -BEYOND) | (along > lines.length[k] + BEYOND)
-                       | self._foreign[k, step // 2::step])
-            distance = np.where(outside, np.inf, np.abs(across))
-            closer = distance < best
-            best = np.where(closer, distance, best)
-            which = np.where(closer, k, which)
-        return best < self._tolerance[step // 2::step], which, best
+        some = slice(step // 2, None, step)
+        points = poses.rotation[:, None] * self._points[some] + poses.place[:, None]
+        which, across = self._nearest.at(points, self._layer[some])
+        return np.abs(across) < self._tolerance[some], which, across
 
-    def claimed(self, poses: Array, step: int = 1) -> Array:
+    def claimed(self, poses: _Poses, step: int = 1) -> Array:
         """Fraction of the strips' pixels on map lines (H,), by one sample out of ``step``."""
         on, _, _ = self._on_lines(poses, step)
         weight = self._weight[step // 2::step]
-        return on @ weight / weight.sum()
+        return on @ (weight / weight.sum())
 
-    def fit(self, poses: Array) -> tuple[Array, Array]:
+    def fit(self, poses: _Poses) -> tuple[Array, Array]:
         """Fraction of the strips' pixels on map lines (H,), and how far off these they are.
 
         :returns: the fraction, and the root mean square distance (H,), px; 0 if none is on any.
         """
-        on, _, distance = self._on_lines(poses)
-        square = np.square(np.where(on, distance, 0.0) * self._pixels_per_metre)
+        on, _, across = self._on_lines(poses)
+        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
         total = on @ self._weight
-        return total / self._weight.sum(), np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
+        return total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
 
-    def explained(self, poses: Array) -> Array:
-        """Fraction of the map lines in view that strips lie on (H,)."""
-        h, points = len(poses), self._map_points
-        c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-        dx, dy = points[:, 0] - poses[:, :1], points[:, 1] - poses[:, 1:2]
-        x, y = c * dx + s * dy, c * dy - s * dx
-        pixels = self._table.pixels(np.column_stack([x.ravel(), y.ravel()]))
-        seen = self._table.sees_floor(pixels).reshape(h, -1)
+    def explained(self, poses: _Poses, step: int = 1) -> Array:
+        """Fraction of the map lines in view that strips lie on (H,).
+
+        :param step: look at one sample of each line out of so many.
+        """
+        lines, share = self._lines, self._share[step // 2::step]
+        # Of each line only what is within reach.
+        foot = poses.place + poses.rotation * self._scale.foot
+        seen = (foot[:, None] - lines.start) * lines.direction.conj()
+        half = np.sqrt(np.maximum(self._scale.reach**2 - np.square(seen.imag), 0.0))
+        first = np.maximum(seen.real - half, 0.0)
+        length = np.minimum(seen.real + half, lines.length) - first
+        pose, line = np.nonzero(length > 0.0)
+        first, length = first[pose, line], length[pose, line]
+        to_base = poses.rotation[pose].conj()
+        along = lines.direction[line] * to_base
+        begin = (lines.start[line] - poses.place[pose]) * to_base + first * along
+        points = begin[:, None] + (length * along)[:, None] * share
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
-        image = pixels.reshape(h, -1, _SAMPLES, 2)
-        step = image[:, :, self._after] - image[:, :, self._before]
-        length = np.hypot(step[..., 0], step[..., 1]) / self._between
-        weight = seen * np.minimum(length.reshape(h, -1), 60.0)
-        covered = np.zeros(seen.shape, dtype=bool)
-        for start, along, length_, tolerance in self._spans:
-            off_x, off_y = x - start[0], y - start[1]
-            reach = off_x * along[0] + off_y * along[1]
-            across = off_y * along[0] - off_x * along[1]
-            covered |= ((np.abs(across) < tolerance) & (reach > -BEYOND)
-                        & (reach < length_ + BEYOND))
-        return (weight * covered).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
+        weight = np.minimum(
+            self._scale.pixels(points, (length / _SAMPLES * along)[:, None]), _LONGEST_SAMPLE)
+        x, y = points.real.ravel(), points.imag.ravel()
+        on = np.abs(np.stack([x, y, np.ones(len(x))], axis=1) @ self._frames) < 1.0
+        on = on[:, ::2] & on[:, 1::2]
+        covered = np.where(on.any(axis=1).reshape(weight.shape), weight, 0.0)
+        count = len(poses.place)
+        total = np.bincount(pose, weight.sum(axis=1), count)
+        return np.bincount(pose, covered.sum(axis=1), count) / np.maximum(total, 1e-9)
 
-    def score(self, poses: Array) -> Array:
+    def score(self, poses: _Poses, step: int = 1) -> Array:
         """Harmonic mean of both fractions (H,)."""
-        return _harmonic(self.claimed(poses), self.explained(poses))
+        return _harmonic(self.claimed(poses, step), self.explained(poses, step))
 
-    def refine(self, poses: Array) -> Array:
-        """Lay the strips on their lines by least squares on the floor, from poses (H, 3)."""
-        lines, inverse = self._lines, 1.0 / self._tolerance
+    def refined(self, poses: _Poses) -> _Poses:
+        """Lay the strips on their lines by least squares on the floor, from poses (H,)."""
+        inverse = 1.0 / self._tolerance
         for _ in range(_ROUNDS):
-            on, which, _ = self._on_lines(poses)
-            c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-            x = c * self._points[:, 0] - s * self._points[:, 1]
-            y = s * self._points[:, 0] + c * self._points[:, 1]
-            nx, ny = lines.normal[which, 0], lines.normal[which, 1]
-            error = nx * (x + poses[:, :1]) + ny * (y + poses[:, 1:2]) - lines.offset[which]
+            on, which, across = self._on_lines(poses)
             weight = on * inverse
-            jacobian = np.stack([nx, ny, ny * x - nx * y], axis=2) * weight[..., None]
-            normal_matrix = np.einsum('hpi,hpj->hij', jacobian, jacobian) + 1e-6 * np.eye(3)
-            slope = np.einsum('hpi,hp->hi', jacobian, error * weight)
-            step = np.linalg.solve(normal_matrix, slope[..., None])[..., 0]
-            poses = np.where(on.sum(axis=1)[:, None] < _LEAST_SAMPLES, poses, poses - step)
+            normal = self._nearest.normal[which] * weight
+            turned = poses.rotation[:, None] * self._points
+            # Derivatives of the distances by x, y and yaw.
+            jacobian = np.stack([normal.real, normal.imag, (normal * turned.conj()).imag], axis=1)
+            matrix = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+            error = np.where(on, across, 0.0) * weight
+            step = np.linalg.solve(matrix, jacobian @ error[..., None])[..., 0]
+            step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
+            poses = _Poses(poses.rotation * np.exp(-1j * step[:, 2]),
+                           poses.place - step[:, 0] - 1j * step[:, 1])
         return poses
 
 
@@ -257,18 +282,19 @@ def _harmonic(a: Array, b: Array) -> Array:
     return 2.0 * a * b / np.maximum(a + b, 1e-9)
 
 
-def _distinct(
-    poses: Array, score: Array, misfit: Array, most: int,
-) -> tuple[FittedCandidate, ...]:
-    """The best of each group of poses that are the same."""
-    found: list[FittedCandidate] = []
-    for index in np.argsort(-score, kind='stable').tolist():
-        pose = Pose2.from_array(poses[index])
-        if all(not same_pose(pose, other.pose) for other in found):
-            found.append(FittedCandidate(pose, float(score[index]), float(misfit[index])))
-        if len(found) == most:
-            break
-    return tuple(found)
+def _distinct(poses: _Poses, score: Array, most: int) -> list[int]:
+    """The best of each group of poses that are the same, best first."""
+    order = np.argsort(-score, kind='stable')
+    place, rotation = poses.place[order], poses.rotation[order]
+    same = np.abs(place - place[:, None]) < _SAME_PLACE
+    same &= (rotation * rotation[:, None].conj()).real > math.cos(_SAME_YAW)
+    found: list[int] = []
+    left = np.ones(len(order), dtype=bool)
+    while len(found) < most and left.any():
+        first = int(left.argmax())
+        found.append(int(order[first]))
+        left &= ~same[first]
+    return found
 
 
 def same_pose(a: Pose2, b: Pose2) -> bool:

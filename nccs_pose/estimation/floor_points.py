@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 from nccs_pose.geometry.floor_table import FloorTable
@@ -25,9 +26,10 @@ from nccs_pose.vision.segment import Segmentation
 import numpy as np
 from numpy.typing import NDArray
 
-# Pixels may lie so much further from a tape's midline than half its width, in footprints.
+# A pixel belongs to a strip if it is no further off than this part of its own footprint beyond
+# the tape's half width.
 _FOOTPRINT = 0.75
-# Points looked at together.
+# Points are compared with lines in blocks of so many.
 _BLOCK = 256
 
 
@@ -35,8 +37,8 @@ _BLOCK = 256
 class FloorPoints:
     """P floor points of line-coloured pixels, blob after blob.
 
-    :ivar floor: (P, 2), metres.
-    :ivar spread: the three elements of J J^T, J the point's derivative by the pixel (3, P).
+    :ivar floor: x, y and 1 of each (P, 3), metres.
+    :ivar spread: xx, xy and yy of J J^T (P, 3), J the point's derivative by the pixel.
     :ivar precision: weight in a fit (P,): far pixels cover much floor and say little.
     :ivar blob: of each (P,), ascending.
     :ivar weight: how many pixels each stands for (P,).
@@ -51,43 +53,41 @@ class FloorPoints:
     @classmethod
     def of(cls, segmentation: Segmentation, table: FloorTable, width: float) -> FloorPoints:
         """Lay blobs on the floor, for tapes of a width in metres."""
-        floor, jacobian = table.floor(segmentation.pixels)
-        jacobian = jacobian * segmentation.pitch
-        by_u, by_v = jacobian[:, :, 0], jacobian[:, :, 1]
-        spread = np.stack([
-            by_u[:, 0] ** 2 + by_v[:, 0] ** 2, by_u[:, 0] * by_u[:, 1] + by_v[:, 0] * by_v[:, 1],
-            by_u[:, 1] ** 2 + by_v[:, 1] ** 2])
-        precision = 1.0 / (spread[0] + spread[2] + 0.1 * width**2)
+        points, jacobian = table.floor(segmentation.pixels)
+        x, y = jacobian[:, 0], jacobian[:, 1]
+        spread = np.empty((len(points), 3))
+        for k, (one, other) in enumerate(((x, x), (x, y), (y, y))):
+            np.einsum('pi,pi->p', one, other, out=spread[:, k])
+        spread *= segmentation.pitch**2
+        precision = 1.0 / (spread[:, 0] + spread[:, 2] + 0.1 * width**2)
+        floor = np.ones((len(points), 3))
+        floor[:, :2] = points
         return cls(floor, spread, precision, segmentation.label, segmentation.weight)
 
     def __getitem__(self, index: NDArray[np.intp] | slice) -> FloorPoints:
         return FloorPoints(
-            self.floor[index], self.spread[:, index], self.precision[index], self.blob[index],
+            self.floor[index], self.spread[index], self.precision[index], self.blob[index],
             self.weight[index])
 
-    def footprint(self, normal: Array) -> Array:
-        """How far each pixel reaches along a normal (2,), or each along its own (P, 2) (P,)."""
-        x, y = normal[..., 0], normal[..., 1]
-        # |J^T n|^2 = n^T (J J^T) n.
-        form = np.array([x * x, 2.0 * x * y, y * y])
-        square = form @ self.spread if normal.ndim == 1 else (form * self.spread).sum(axis=0)
-        return np.sqrt(np.maximum(square, 0.0))
-
-    def beyond(self, normal: Array, distance: Array, width: float) -> Array:
-        """How far the points are from being a tape's (P,), metres; below 0 they may be.
-
-        :param normal: of the tape's midline (2,), or one for each point (P, 2).
-        :param distance: of each point from the midline (P,), of either sign.
-        """
-        return np.abs(distance) - _FOOTPRINT * self.footprint(normal) - _half(width)
+    @cached_property
+    def moments(self) -> Array:
+        """1, x, y, xx, xy and yy of each point times its precision (P, 6)."""
+        x, y = self.floor[:, 0], self.floor[:, 1]
+        moments = np.empty((len(x), 6))
+        moments[:, 0] = self.precision
+        moments[:, 1] = self.precision * x
+        moments[:, 2] = self.precision * y
+        moments[:, 3] = moments[:, 1] * x
+        moments[:, 4] = moments[:, 1] * y
+        moments[:, 5] = moments[:, 2] * y
+        return moments
 
     def near(self, normals: Array, offsets: Array, width: float) -> NDArray[np.float32]:
         """1 where a point may be one of a tape's along each of C lines (P, C), else 0."""
         x, y = normals.T.astype(np.float32)
         by_spread = np.float32(_FOOTPRINT**2) * np.stack([x * x, 2.0 * x * y, y * y])
         by_floor = np.stack([x, y, -offsets.astype(np.float32)])
-        floor = np.column_stack([self.floor, np.ones(len(self.floor))]).astype(np.float32)
-        spread = self.spread.T.astype(np.float32)
+        floor, spread = self.floor.astype(np.float32), self.spread.astype(np.float32)
         near = np.empty((len(floor), len(normals)), np.float32)
         # In blocks that stay in the processor's cache.
         for first in range(0, len(floor), _BLOCK):
@@ -100,6 +100,66 @@ class FloorPoints:
         return near
 
 
+@dataclass(frozen=True)
+class FloorLine:
+    """A line on the floor: the points x, y with y cos(angle) - x sin(angle) = offset.
+
+    :ivar angle: of its direction, radians.
+    :ivar offset: to its left, metres.
+    """
+
+    angle: float
+    offset: float
+
+    @classmethod
+    def through(cls, moments: Array) -> FloorLine:
+        """The total least squares line of summed moments (6,); see :attr:`FloorPoints.moments`.
+
+        One line in plain numbers: arrays of one are slow.
+        """
+        total, x, y, xx, xy, yy = moments.tolist()
+        x, y = x / total, y / total
+        angle = 0.5 * math.atan2(
+            2.0 * (xy - total * x * y), xx - yy - total * (x * x - y * y))
+        return cls(angle, y * math.cos(angle) - x * math.sin(angle))
+
+    @property
+    def normal(self) -> Array:
+        """Unit (2,), to the left of the direction."""
+        return np.array([-math.sin(self.angle), math.cos(self.angle)])
+
+    def at(self, along: float) -> Array:
+        """The point (2,) that is so far along it, metres."""
+        c, s = math.cos(self.angle), math.sin(self.angle)
+        return np.array([along * c - self.offset * s, along * s + self.offset * c])
+
+    def footprint(self, spread: Array) -> Array:
+        """How far pixels of spreads (N, 3) reach across it (N,), metres."""
+        x, y = -math.sin(self.angle), math.cos(self.angle)
+        # |J^T n|^2 = n^T (J J^T) n.
+        return np.sqrt(spread @ np.array([x * x, 2.0 * x * y, y * y]))
+
+    def places(self, points: FloorPoints, width: float) -> tuple[Array, Array]:
+        """How far along the line points are (P,), and how far from being a tape's on it (P,).
+
+        Below 0 they may be of it.
+        """
+        c, s = math.cos(self.angle), math.sin(self.angle)
+        along, off = np.array([[c, s, 0.0], [-s, c, -self.offset]]) @ points.floor.T
+        return along, np.abs(off) - (_FOOTPRINT * self.footprint(points.spread) + _half(width))
+
+
+def misplaced(points: FloorPoints, normals: Array, offsets: Array, width: float) -> Array:
+    """Whether each point is none of a tape's on a line of its own (P,).
+
+    :param normals: of the lines (P, 2).
+    :param offsets: likewise (P,), metres.
+    """
+    off = np.einsum('pi,pi->p', points.floor[:, :2], normals) - offsets
+    square = np.einsum('pi,pi->p', points.spread, squares(normals) * [1.0, 2.0, 1.0])
+    return np.abs(off) > _FOOTPRINT * np.sqrt(square) + _half(width)
+
+
 def _half(width: float) -> float:
     """How far from a tape's midline a point of its floor may be, metres."""
     return 0.5 * width + 0.005
@@ -108,31 +168,17 @@ def _half(width: float) -> float:
 def squares(points: Array) -> Array:
     """xx, xy and yy of points (N, 2) as (N, 3)."""
     x, y = points[:, 0], points[:, 1]
-    return np.column_stack([x * x, x * y, y * y])
+    return np.stack([x * x, x * y, y * y], axis=1)
 
 
-def principal_lines(mean: Array, second: Array) -> tuple[Array, Array]:
+def principal_lines(moments: Array) -> tuple[Array, Array]:
     """Total least squares lines: unit normals (K, 2) and offsets (K,).
 
-    :param mean: centres of gravity (K, 2).
-    :param second: xx, xy and yy about them (K, 3).
+    :param moments: summed over each one's points (K, 6); see :attr:`FloorPoints.moments`.
     """
+    mean = moments[:, 1:3] / moments[:, :1]
+    xx, xy, yy = (moments[:, 3:] - moments[:, :1] * squares(mean)).T
     # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
-    angle = 0.5 * np.arctan2(2.0 * second[:, 1], second[:, 0] - second[:, 2])
-    normal = np.column_stack([-np.sin(angle), np.cos(angle)])
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
     return normal, np.einsum('ki,ki->k', normal, mean)
-
-
-def fit_line(floor: Array, weight: Array) -> tuple[Array, float]:
-    """Total least squares line through points (M, 2): unit normal (2,) and offset.
-
-    One line in plain numbers: arrays of one are slow.
-    """
-    x, y = floor[:, 0], floor[:, 1]
-    total = weight.sum()
-    mean_x, mean_y = weight @ x / total, weight @ y / total
-    x, y = x - mean_x, y - mean_y
-    by_x = weight * x
-    angle = 0.5 * math.atan2(2.0 * (by_x @ y), by_x @ x - (weight * y) @ y)
-    normal = np.array([-math.sin(angle), math.cos(angle)])
-    return normal, float(normal[0] * mean_x + normal[1] * mean_y)

@@ -24,10 +24,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from nccs_pose.estimation.floor_points import fit_line, FloorPoints, principal_lines, squares
+from nccs_pose.estimation.floor_points import (
+    FloorLine,
+    FloorPoints,
+    misplaced,
+    principal_lines,
+)
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.segment import Segmentation
+from nccs_pose.vision.segment import Segmentation, upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +40,8 @@ from numpy.typing import NDArray
 _LEAST_PIXELS = 10
 # Of a large blob only some pixels are looked at; a few of them in a row are no line yet.
 _LEAST_SAMPLES = 8
+# Fewer than this to start from hardly ever grow to so many.
+_LEAST_START = 4
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
@@ -104,10 +111,10 @@ def floor_segments(
     normals, offsets, kept = _candidates(points, width)
     if len(normals) == 0:
         return ()
-    points, pixels = points[kept], segmentation.pixels[kept]
     # What is left of a thinned blob stands for all of it.
-    share = np.bincount(segmentation.label) / np.maximum(np.bincount(
-        points.blob, minlength=int(segmentation.label[-1]) + 1), 1)
+    label = segmentation.label
+    share = np.bincount(label) / np.maximum(np.bincount(label[kept], minlength=label[-1] + 1), 1)
+    points = points[kept]
     points = replace(points, weight=points.weight * share[points.blob])
     near = points.near(normals, offsets, width)
     support = (points.weight.astype(np.float32) @ near).astype(float)
@@ -121,18 +128,22 @@ def floor_segments(
         support[best] = -np.inf
         start = np.flatnonzero((near[:, best] > 0.0) & free)
         # Many lines through one small thing start from the very same points.
-        if start.tobytes() in futile:
+        if len(start) < _LEAST_START or start.tobytes() in futile:
             continue
         found = _strip(points, free, start, width)
         if found is None:
             futile.add(start.tobytes())
             continue
         futile.clear()
-        normal, offset, inside, beside = found
+        line, along, inside, beside = found
         if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
-            inside = _one_tape(points, inside, normal, longest)
-            segments.append(
-                _segment(points, segmentation, pixels, inside, normal, offset, colour))
+            inside = _one_tape(points, along, inside, longest)
+            run = along[inside]
+            ends = line.at(run.min()), line.at(run.max())
+            segments.append(FloorSegment(
+                line.normal, line.offset, *ends, float(points.weight[inside].sum()),
+                upper_median(line.footprint(points.spread[inside])),
+                segmentation.pixels[kept[inside]], colour, segmentation.pitch))
             taken = inside
         else:
             # What is left of a solid must not pass for a thinner thing.
@@ -150,23 +161,23 @@ def _candidates(
 
     Each blob's own line, and where that does not fit, those through some of its pixels.
     """
-    first = np.flatnonzero(np.diff(points.blob, prepend=-1))
-    size = np.diff(first, append=len(points.blob))
-    number = np.repeat(np.arange(len(first)), size)
-    own, own_offset = _blob_lines(points, first, number)
-    normal = own[number]
-    distance = np.einsum('pi,pi->p', points.floor, normal) - own_offset[number]
-    off = points.beyond(normal, distance, width) > 0.0
+    begins = np.ones(len(points.blob), dtype=bool)
+    begins[1:] = points.blob[1:] != points.blob[:-1]
+    first = np.flatnonzero(begins)
+    number = np.cumsum(begins) - 1
+    size = np.bincount(number)
+    own, own_offset = principal_lines(np.add.reduceat(points.moments, first))
+    off = misplaced(points, own[number], own_offset[number], width)
     misfit = np.add.reduceat(off.astype(float), first) / size
     speck = size < _LEAST_LINE
     tangled = ~speck & (size >= _LEAST_PIXELS) & (misfit > _MISFIT)
-    count = int(tangled.sum())
+    count = int(np.count_nonzero(tangled))
     step = 1 + int(size[tangled].sum()) // _MOST_PIXELS
     stride = np.where(tangled, step, np.where(size < _SHORT, 1, _THINNED))
     kept = ((np.arange(len(number)) - first[number]) % stride[number] == 0) & ~speck[number]
-    rng = np.random.default_rng(0)
-    seeds = max(1, min(_SEEDS, _MOST_SEEDS // max(1, count)))
     lines = [(own[~speck], own_offset[~speck])]
+    if count > 0:
+        rng, seeds = np.random.default_rng(0), max(1, min(_SEEDS, _MOST_SEEDS // count))
     for k in np.flatnonzero(tangled).tolist():
         part = points[first[k]:first[k] + size[k]:step]
         lines += [_through_neighbours(part, seeds), _through_pairs(part, rng, seeds)]
@@ -174,43 +185,21 @@ def _candidates(
     return normals, offsets, np.flatnonzero(kept)
 
 
-def _blob_lines(
-    points: FloorPoints, first: NDArray[np.intp], number: NDArray[np.intp],
-) -> tuple[Array, Array]:
-    """Each blob's own line: normals (B, 2) and offsets (B,).
-
-    :param first: where each blob begins (B,).
-    :param number: of each point's blob among them (P,).
-    """
-    weight = points.precision
-    total = np.add.reduceat(weight, first)[:, None]
-    mean = np.add.reduceat(weight[:, None] * points.floor, first) / total
-    moved = points.floor - mean[number]
-    second = np.add.reduceat(weight[:, None] * squares(moved), first)
-    return principal_lines(mean, second)
-
-
 def _through_neighbours(part: FloorPoints, seeds: int) -> tuple[Array, Array]:
     """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
     seed = np.arange(0, len(part.floor), max(1, len(part.floor) // seeds))
-    footprint = np.sqrt(0.5 * (part.spread[0, seed] + part.spread[2, seed]))
+    footprint = np.sqrt(0.5 * (part.spread[seed, 0] + part.spread[seed, 2]))
     reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint
-    x, y = part.floor.T
+    x, y, _ = part.floor.T
     near = np.square(x - x[seed, None]) + np.square(y - y[seed, None]) < np.square(reach)[:, None]
-    near = near[near.sum(axis=1) >= _LEAST_LINE]
-    weight = near * part.precision
-    moved = part.floor - part.floor.mean(axis=0)
-    sums = weight @ np.column_stack([np.ones(len(moved)), moved, squares(moved)])
-    mean = sums[:, 1:3] / sums[:, :1]
-    second = sums[:, 3:] - sums[:, :1] * squares(mean)
-    return principal_lines(mean + part.floor.mean(axis=0), second)
+    return principal_lines(near[near.sum(axis=1) >= _LEAST_LINE] @ part.moments)
 
 
 def _through_pairs(
     part: FloorPoints, rng: np.random.Generator, seeds: int,
 ) -> tuple[Array, Array]:
     """Lines through random pairs of a blob's pixels."""
-    pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2))]
+    pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2)), :2]
     along = pair[:, 1] - pair[:, 0]
     length = np.hypot(along[:, 0], along[:, 1])
     pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
@@ -220,21 +209,20 @@ def _through_pairs(
 
 def _strip(
     points: FloorPoints, free: NDArray[np.bool_], inside: NDArray[np.intp], width: float,
-) -> tuple[Array, float, NDArray[np.intp], NDArray[np.intp]] | None:
+) -> tuple[FloorLine, Array, NDArray[np.intp], NDArray[np.intp]] | None:
     """Refine a strip on its own pixels.
 
     :param inside: points to start from.
-    :returns: normal, offset, its points and those of its blobs that lie just beside it; None
-        where too little is left.
+    :returns: its line, how far along that all points are (P,), metres, its own points and those
+        of its blobs that lie just beside it; None where too little is left.
     """
     for _ in range(2):
-        normal, offset = fit_line(points.floor[inside], points.precision[inside])
-        beyond = points.beyond(normal, points.floor @ normal - offset, width)
-        direction = np.array([-normal[1], normal[0]])
-        along = points.floor @ direction
+        line = FloorLine.through(points.moments[inside].sum(axis=0))
+        along, beyond = line.places(points, width)
         before = inside
-        inside = _longest_run(
-            points, along, np.flatnonzero(free & (beyond < 0.0)), _LONGEST_GAP)
+        inside = np.flatnonzero((beyond < 0.0) & free)
+        if len(inside) >= _LEAST_SAMPLES:
+            inside = _longest_run(points, along, inside, _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
         if np.array_equal(inside, before):
@@ -243,18 +231,19 @@ def _strip(
     if high - low < _LEAST_LENGTH:
         return None
     # Only what hangs together with the strip counts: another tape may well cross it.
-    own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
-    own[points.blob[inside]] = True
     beside = np.flatnonzero((beyond > 0.0) & (beyond < _BESIDE) & (along > low) & (along < high))
-    return normal, offset, inside, beside[own[points.blob[beside]]]
+    if len(beside) > 0:
+        own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
+        own[points.blob[inside]] = True
+        beside = beside[own[points.blob[beside]]]
+    return line, along, inside, beside
 
 
 def _one_tape(
-    points: FloorPoints, inside: NDArray[np.intp], normal: Array, longest: float,
+    points: FloorPoints, along: Array, inside: NDArray[np.intp], longest: float,
 ) -> NDArray[np.intp]:
     """Of a strip that is longer than any tape the heaviest part between two gaps."""
-    along = points.floor @ np.array([-normal[1], normal[0]])
-    if np.ptp(along[inside]) <= _TOO_LONG * longest:
+    if math.isinf(longest) or np.ptp(along[inside]) <= _TOO_LONG * longest:
         return inside
     return _longest_run(points, along, inside, _ROW_GAP)
 
@@ -266,25 +255,11 @@ def _longest_run(
 
     :param along: the strip's direction, of all points (P,), metres.
     """
-    if len(inside) == 0:
-        return inside
     order = inside[np.argsort(along[inside], kind='stable')]
-    gaps = np.flatnonzero(np.diff(along[order]) > longest_gap) + 1
+    run = along[order]
+    gaps = np.flatnonzero(run[1:] - run[:-1] > longest_gap) + 1
     if len(gaps) == 0:
         return inside
-    bounds = np.concatenate([[0], gaps])
-    heaviest = int(np.add.reduceat(points.weight[order], bounds).argmax())
-    return np.sort(np.split(order, gaps)[heaviest])
-
-
-def _segment(
-    points: FloorPoints, segmentation: Segmentation, pixels: Array, inside: NDArray[np.intp],
-    normal: Array, offset: float, colour: str,
-) -> FloorSegment:
-    direction = np.array([-normal[1], normal[0]])
-    along = points.floor[inside] @ direction
-    return FloorSegment(
-        normal, offset, offset * normal + along.min() * direction,
-        offset * normal + along.max() * direction, float(points.weight[inside].sum()),
-        float(np.median(points.footprint(normal)[inside])), pixels[inside], colour,
-        segmentation.pitch)
+    bounds = [0, *gaps.tolist(), len(order)]
+    heaviest = int(np.add.reduceat(points.weight[order], bounds[:-1]).argmax())
+    return np.sort(order[bounds[heaviest]:bounds[heaviest + 1]])

@@ -254,7 +254,9 @@ class Localiser:
         for sight in sights(
                 image, self._searcher, self._fresh_colours(), self._in_vain, watch.lap):
             segments = sight.segments
-            sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction)
+            sifted = self._sifter.sift(
+                sight, hypotheses, self._doubts, prediction, told=self._prior is not None
+                or prediction is not None or bool(hypotheses))
             watch.lap('measure')
             refusals += sifted.refused
             if sifted.held:
@@ -282,6 +284,8 @@ class Localiser:
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
         hypotheses = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
+        others = (*hypotheses[1:], *(Hypothesis(c.pose, (c.score,)) for c in sifted.open))
+        hypotheses = (hypotheses[0], *sorted(others, key=lambda h: -h.mean))
         if lines_used(held[0].alignment) < 3:
             hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
         self._open, self._open_odometry = hypotheses, now

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from itertools import permutations
 import math
 
-from nccs_pose.estimation.association import FittedCandidate, global_candidates, score_pose
+from nccs_pose.estimation.association import Associator, FittedCandidate
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.floor_table import FloorTable
@@ -67,7 +67,7 @@ class Searcher:
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
         self._table = table
-        self._map = line_map
+        self._associator = Associator(line_map, table)
         self._options = options
         self._widths: dict[str, float] = {}
         for line in line_map:
@@ -164,11 +164,11 @@ class Searcher:
 
     def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:
         """Poses that explain the strips, best first."""
-        return global_candidates(segments, self._map, self._table)
+        return self._associator.candidates(segments)
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""
-        return score_pose(pose, segments, self._map, self._table)
+        return self._associator.score(pose, segments)
 
 
 def _in_a_row(line_map: LineMap) -> bool:

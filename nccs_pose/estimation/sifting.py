@@ -43,6 +43,8 @@ _WORTH_TRYING = 0.6
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
+_DOUBTFUL = Objection(
+    'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +62,14 @@ class Sifted:
     :ivar held: poses that explain the image, best first.
     :ivar hidden: poses that would, if something hid the lines that they miss.
     :ivar refused: the others, the best first.
+    :ivar open: poses that may explain it as well as the best of those that hold, but were not
+        laid on it, or that it cannot tell from another; their scores are no higher than its.
     """
 
     held: list[Found]
     hidden: list[Candidate]
     refused: list[Refused]
+    open: list[Candidate]
 
 
 @dataclass(frozen=True)
@@ -101,18 +106,22 @@ class Sifter:
 
     def sift(
         self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
-        prediction: Prediction | None,
+        prediction: Prediction | None, *, told: bool,
     ) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image.
 
         :param doubts: lines that were seen beside their place and not in it since.
+        :param told: whether something else than the image can decide between equal poses. If not,
+            two are enough to know that it does not.
         """
         options = self._options
         starts = [_Start(h.pose, options.band) for h in hypotheses]
         starts += [
             _Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[:_TRIED]
             if c.score >= _WORTH_TRYING * sight.promise]
-        sifted = Sifted([], [], [])
+        left = [_Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[_TRIED:]]
+        sifted = Sifted([], [], [], [])
+        doubtful: list[Found] = []
         seen: list[Pose2] = []
         best: tuple[_Start, Found] | None = None
         # What holds adds its twins to the end of the queue.
@@ -120,6 +129,9 @@ class Sifter:
             if best is not None and not self._rivals(start, *best):
                 continue
             if any(same_pose(start.pose, pose) for pose in seen):
+                continue
+            if not told and len(self._equals(sifted.held)) > 1:
+                left.append(start)
                 continue
             alignment = self._laid(sight, start)
             if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
@@ -129,9 +141,9 @@ class Sifter:
             found = self._judge.found(
                 sight.image, alignment, sight.segments, doubts, expected=expected)
             if isinstance(found, Found) and not expected and self._doubtful(found, sight):
-                found = Objection(
-                    'its lines lie badly on the image, and another pose shows about as much',
-                    hidden=True)
+                doubtful.append(found)
+                sifted.refused.append(Refused(_DOUBTFUL, alignment))
+                continue
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found.hidden:
@@ -143,7 +155,38 @@ class Sifter:
             if best is None or found.score > best[1].score:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)
+        if best is not None:
+            self._leave_open(sifted, best[1], left, doubtful, seen)
         return sifted
+
+    def _equals(self, found: list[Found]) -> list[Found]:
+        """Those of some poses that explain an image about as well as the best of them."""
+        most = max((f.score for f in found), default=0.0)
+        return [f for f in found if f.score >= self._options.ambiguity_ratio * most]
+
+    def _leave_open(
+        self, sifted: Sifted, best: Found, left: list[_Start], doubtful: list[Found],
+        seen: list[Pose2],
+    ) -> None:
+        """Add the poses that are left open, beside the best that holds, and what may be hidden.
+
+        :param left: what was not laid on the image.
+        :param doubtful: what was, and shows about as much as another pose.
+        :param seen: all that was laid on the image.
+        """
+        ratio = self._options.ambiguity_ratio
+        for found in doubtful:
+            pose = found.alignment.pose
+            if found.score >= ratio * best.score:
+                sifted.open.append(Candidate(pose, min(found.score, best.score)))
+            else:
+                sifted.hidden.append(Candidate(pose, found.by_strips))
+        seen = list(seen)
+        for start in left:
+            share = 1.0 if start.score is None else min(start.score / best.by_strips, 1.0)
+            if share >= ratio and not any(same_pose(start.pose, pose) for pose in seen):
+                seen.append(start.pose)
+                sifted.open.append(Candidate(start.pose, share * best.score))
 
     def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
         """Lay a pose on the image: by searching its surroundings only where a line is left out."""

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 # A best pose with this score leaves nothing to look for; one with half of that is worth a try when
 # the next scores less than this part of it.
 _PLAIN = 0.8
-_RIVAL = 0.6
+_RIVAL = 0.8
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
 import math
 
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.geometry.floor_table import as_complex, Complex
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,93 +37,109 @@ BEYOND = 0.2
 _JOINED = 0.2
 
 
-@dataclass(frozen=True, eq=False)
 class FloorLines:
-    """The map's floor lines of one image's colours, as 2-D lines n . p = c."""
+    """The map's floor lines, their points complex numbers x + iy of the map.
 
-    start: Array
-    direction: Array
-    normal: Array
-    offset: Array
-    length: Array
-    colour: tuple[str, ...]
+    :ivar start: one end (L,), metres.
+    :ivar direction: unit (L,), from there to the other end.
+    :ivar length: metres (L,).
+    :ivar colour: colour class of each.
+    """
 
-    @classmethod
-    def of(cls, line_map: LineMap) -> FloorLines:
-        start, direction = line_map.starts[:, :2], line_map.directions[:, :2]
-        normal = np.column_stack([-direction[:, 1], direction[:, 0]])
-        return cls(
-            start, direction, normal, np.einsum('li,li->l', normal, start), line_map.lengths,
-            tuple(line.colour for line in line_map))
+    def __init__(self, line_map: LineMap) -> None:
+        self.start = as_complex(line_map.starts[:, :2])
+        self.direction = as_complex(line_map.directions[:, :2])
+        self.length = line_map.lengths
+        self.colour = tuple(line.colour for line in line_map)
+
+    @cached_property
+    def crossings(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Complex]:
+        """Ordered pairs of lines that cross, and the second's direction in the first's frame."""
+        turn = self.direction * self.direction.conj()[:, None]
+        first, second = np.nonzero(np.abs(turn.imag) > math.sin(_CROSSING - _ANGLE_GATE))
+        return first, second, turn[first, second]
 
 
-def poses_of_pairs(segments: tuple[FloorSegment, ...], lines: FloorLines) -> Array:
-    """Poses (H, 3) that lay a pair of strips on a pair of map lines."""
-    if len(segments) < 2:
-        return np.zeros((0, 3))
-    map_angle = np.arctan2(lines.direction[:, 1], lines.direction[:, 0])
-    angle = np.array([math.atan2(-s.normal[0], s.normal[1]) for s in segments])
-    alike = np.array([[s.colour == colour for colour in lines.colour] for s in segments])
-    first, second = np.triu_indices(len(segments), 1)
-    between = angle[first] - angle[second]
-    crossing = np.abs(np.sin(between)) >= math.sin(_CROSSING)
-    first, second, between = first[crossing], second[crossing], between[crossing]
-    off = np.subtract.outer(map_angle, map_angle) - between[:, None, None]
-    match = (np.abs(np.sin(off)) < math.sin(_ANGLE_GATE)) & ~np.eye(len(map_angle), dtype=bool)
-    match &= alike[first][:, :, None] & alike[second][:, None, :]
-    pair, a, b = np.nonzero(match)
-    first, second = first[pair], second[pair]
-    yaw = map_angle[a] - angle[first] + 0.25 * np.sin(2.0 * (
-        map_angle[b] - map_angle[a] + angle[first] - angle[second]))
-    strips = _Strips(np.array([s.start for s in segments]), np.array([s.end for s in segments]))
-    poses: list[Array] = []
-    for begin in range(0, len(pair), _ENOUGH // 2):
-        part = slice(begin, begin + _ENOUGH // 2)
-        # Either way round.
-        turned = np.concatenate([yaw[part], yaw[part] + np.pi])
-        one, other, on_a, on_b = (np.tile(index[part], 2) for index in (first, second, a, b))
-        poses.append(_intersect(turned, strips[one], strips[other], on_a, on_b, lines))
-        if sum(map(len, poses)) > _ENOUGH:
+class StripLines:
+    """Strips in base_link, their points complex numbers x + iy.
+
+    :ivar start: one end (S,), metres.
+    :ivar direction: unit (S,), from there to the other end.
+    :ivar length: metres (S,).
+    :ivar middle: between both ends (S,), metres.
+    :ivar colour: colour class of each.
+    """
+
+    def __init__(self, segments: tuple[FloorSegment, ...]) -> None:
+        start, end, left = np.array([(s.start, s.end, s.normal) for s in segments]).reshape(
+            -1, 6).view(np.complex128).T
+        self.start, self.length, self.direction = start, np.abs(end - start), -1j * left
+        self.middle = 0.5 * (start + end)
+        self.colour = tuple(s.colour for s in segments)
+
+    def fits(self, lines: FloorLines) -> NDArray[np.bool_]:
+        """Whether a strip can lie on a line (S, L), by its length and colour."""
+        fits = self.length[:, None] * (1.0 - _JOINED) < lines.length + BEYOND
+        if len(set(lines.colour)) > 1:
+            fits &= np.array(self.colour)[:, None] == np.array(lines.colour)
+        return fits
+
+
+def poses_of_pairs(
+    strips: StripLines, lines: FloorLines, most: int,
+) -> tuple[Complex, Complex]:
+    """Poses that lay a pair of strips on a pair of map lines, those of the heaviest strips first.
+
+    :param strips: the heaviest first.
+    :param most: only so many of them are laid.
+    :returns: the poses' rotations, unit (H,), and places (H,).
+    """
+    a, b, turn = lines.crossings
+    first, second = np.array(list(combinations(range(min(most, len(strips.length))), 2))).T
+    between = strips.direction[second] * strips.direction[first].conj()
+    match = np.abs((turn * between.conj()[:, None]).imag) < math.sin(_ANGLE_GATE)
+    match &= (np.abs(between.imag) >= math.sin(_CROSSING))[:, None]
+    fits = strips.fits(lines)
+    match &= fits[first][:, a] & fits[second][:, b]
+    pair, crossing = np.nonzero(match)
+    if len(pair) == 0:
+        return np.zeros(0, complex), np.zeros(0, complex)
+    found, count = [], 0
+    # Whole pairs of strips: any of them may be the one that is not what it seems.
+    starts = np.flatnonzero(np.diff(pair, prepend=-1))
+    cuts = starts[1:] if len(pair) > _ENOUGH else starts[:0]
+    for part in np.split(np.arange(len(pair)), cuts):
+        one, other = first[pair[part]], second[pair[part]]
+        found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))
+        count += len(found[-1][0])
+        if count > _ENOUGH:
             break
-    return np.concatenate(poses) if poses else np.zeros((0, 3))
+    rotations, places = (np.concatenate(parts) for parts in zip(*found))
+    return rotations, places
 
 
-@dataclass(frozen=True, eq=False)
-class _Strips:
-    """Ends of strips in base_link, (S, 2) each."""
-
-    start: Array
-    end: Array
-
-    def __getitem__(self, index: NDArray[np.intp]) -> _Strips:
-        return _Strips(self.start[index], self.end[index])
-
-
-def _intersect(
-    yaw: Array, first: _Strips, second: _Strips, a: NDArray[np.intp], b: NDArray[np.intp],
-    lines: FloorLines,
-) -> Array:
-    """Poses (K, 3) that put K strips' middles on lines a and b (K,), where the extents agree."""
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-
-    def turned(points: Array) -> Array:
-        return np.hstack([c * points[:, :1] - s * points[:, 1:],
-                          s * points[:, :1] + c * points[:, 1:]])
-
-    ends = [(turned(strip.start), turned(strip.end)) for strip in (first, second)]
-    n_a, n_b = lines.normal[a], lines.normal[b]
-    right_a, right_b = (
-        lines.offset[line] - 0.5 * np.einsum('ki,ki->k', lines.normal[line], start + end)
-        for line, (start, end) in zip((a, b), ends))
-    det = n_a[:, 0] * n_b[:, 1] - n_a[:, 1] * n_b[:, 0]
-    t = np.column_stack([n_b[:, 1] * right_a - n_a[:, 1] * right_b,
-                         n_a[:, 0] * right_b - n_b[:, 0] * right_a]) / det[:, None]
-    fits = np.ones(len(yaw), dtype=bool)
-    for (start, end), line in zip(ends, (a, b)):
-        origin, direction = t - lines.start[line], lines.direction[line]
-        one, other = (np.einsum('ki,ki->k', direction, at + origin) for at in (start, end))
-        outside = (np.maximum(-np.minimum(one, other), 0.0)
-                   + np.maximum(np.maximum(one, other) - lines.length[line], 0.0))
-        # Something in line with a tape may have been joined to it.
-        fits &= outside < BEYOND + _JOINED * np.hypot(*(end - start).T)
-    return np.column_stack([t, yaw])[fits]
+def _laid(
+    strips: StripLines, first: NDArray[np.intp], second: NDArray[np.intp], lines: FloorLines,
+    a: NDArray[np.intp], b: NDArray[np.intp],
+) -> tuple[Complex, Complex]:
+    """Poses that put K strips' middles on lines a and b (K,), where the extents agree."""
+    strip, line = np.array([first, second]), np.array([a, b])
+    direction = lines.direction[line]
+    by_first, by_second = direction * strips.direction[strip].conj()
+    # Strips and lines go either way: half a turn between both does not count.
+    rotation = by_first + np.copysign(1.0, (by_second * by_first.conj()).real) * by_second
+    rotation /= np.abs(rotation)
+    # Either way round.
+    rotation = np.concatenate([rotation, -rotation])
+    strip, direction, line = np.tile(strip, 2), np.tile(direction, 2), np.tile(line, 2)
+    # Each middle in its line's own frame, along + i across, but for the place.
+    middle = (rotation * strips.middle[strip] - lines.start[line]) * direction.conj()
+    off = middle.imag / (direction[1] * direction[0].conj()).imag
+    place = off[1] * direction[0] - off[0] * direction[1]
+    along = middle.real + (place * direction.conj()).real
+    half = 0.5 * strips.length[strip]
+    outside = (np.maximum(half - along, 0.0)
+               + np.maximum(along + half - lines.length[line], 0.0))
+    # Something in line with a tape may have been joined to it.
+    good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=0)
+    return rotation[good], place[good]

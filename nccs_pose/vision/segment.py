@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 from nccs_pose.errors import VisionError
@@ -79,9 +80,15 @@ def chromatic_mask(
     return raised_mask(contrast_of(image, colour), brightness(image), gate, least, window)
 
 
+def upper_median(values: NDArray[Any]) -> float:
+    """The middle one of values of any shape, the upper of two."""
+    middle = values.size // 2
+    return float(np.partition(values.ravel(), middle)[middle])
+
+
 def brightness(image: NDArray[np.uint8]) -> float:
     """How bright an image is, grey levels."""
-    return float(np.median(image[::8, ::8, 1]))
+    return upper_median(image[::8, ::8, 1])
 
 
 def raised_mask(
@@ -94,14 +101,13 @@ def raised_mask(
     """
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
     around = cv2.blur(feature, (window, window))
-    sparse = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
-    noise = 1.4826 * float(np.median(np.abs(sparse)))
+    noise = 1.4826 * upper_median(cv2.absdiff(feature[::4, ::4].copy(), around[::4, ::4].copy()))
     threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
     # whole.
-    height = cv2.subtract(feature, float(np.median(feature[::8, ::8])))
+    height = cv2.subtract(feature, upper_median(feature[::8, ::8]))
     peak = cv2.convertScaleAbs(
         cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
