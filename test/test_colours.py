@@ -86,7 +86,7 @@ def test_tapes_of_nearly_the_floors_colour_are_found_where_there_is_light(
         colours: tuple[str, ...], floor: str, light: str) -> None:
     scene = _scene(colours, floor, light)
     localiser = Localiser(scene.rig, scene.line_map)
-    assert sum(_found(localiser, scene, k) for k in range(10)) >= 9
+    assert sum(_found(localiser, scene, k) for k in range(10)) >= 8
 
 
 @pytest.mark.parametrize('light', ['dim', 'bright', 'warm', 'cold'])
