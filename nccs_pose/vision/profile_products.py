@@ -35,19 +35,18 @@ _SIDES = np.array([1.0, -1.0], np.float32)[:, None, None]
 
 
 def read_pixels(
-    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int, density: float,
+    image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """The pixels nearest to a grid over each band: values (N, P, 3) and place across s (N, P), px.
 
     :param margin: beyond the edges, px.
     :param rows: of the grid along each station's piece of curve.
-    :param density: of the grid across, per px, or more.
     """
     # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
     # across for its real part and the one along (backwards) for its imaginary part.
     centre, across = as_complex(bands.centre), as_complex(bands.across)
     half_band = bands.half_width + margin
-    k = min(math.ceil(2.0 * density * float(half_band.max())) + 1, _MOST_ACROSS)
+    k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
     bend = 0.5 * bands.bend
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
     terms = np.empty((len(bands), 4), np.complex64)

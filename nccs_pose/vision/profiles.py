@@ -43,8 +43,6 @@ _MARGIN_BLURS = 2.0
 _DENSITY = 2.0
 _DENSITY_BLUR = 0.62
 _LEAST_DENSITY = 0.45
-# Across the curve they stand a pixel apart, or as far as this allows where that is more.
-_ACROSS_BLUR = 0.92
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
 _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
@@ -121,7 +119,7 @@ def fit_profiles(
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
-    pixels, s = read_pixels(image, bands, margin, rows, min(_ACROSS_BLUR / blur, 1.0))
+    pixels, s = read_pixels(image, bands, margin, rows)
     groups, count = _Groups.of(bands), s.shape[1]
     pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, groups.first)
     size = count * groups.members
