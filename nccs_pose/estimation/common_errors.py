@@ -43,7 +43,7 @@ def correlation_factor(residual: Array, label: NDArray[np.intp], unknowns: int) 
     Few of them can be told from noise; exp(2 (c_1 + c_2)) is the same for small ones and stays
     positive. For large ones it is more: where neighbours have much in common (floors with texture,
     coarse JPEG), whole lines have too, which the pose takes for its own so that no residual shows
-    it. On simulated images of all kinds the squared errors of poses were what it says, to a tenth.
+    it. On simulated images of all kinds squared errors of poses were what it says, to an eighth.
 
     What the fit takes out of the residuals is what they have in common: each unknown, one in N of
     their variance times this factor, from every c_k alike. A few more stand for the uncertainty

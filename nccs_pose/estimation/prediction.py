@@ -191,12 +191,15 @@ class BandPredictor:
         """Floor between a tape's edge and the next tape (L, G), metres, along each tape."""
         along = np.arange(0.5, _GAPS) / _GAPS
         points = self._start[:, None] + along * (self._length * self._direction)[:, None]
-        # In the frame of each tape: (L, L, G), the other tape first.
-        seen = (points - self._start[:, None, None]) * self._direction.conj()[:, None, None]
-        beyond = seen.real - np.clip(seen.real, 0.0, self._length[:, None, None])
-        gap = np.hypot(beyond, seen.imag) - self._half_width[:, None, None]
-        gap[np.diag_indices(len(gap))] = np.inf
-        return gap.min(axis=0, initial=np.inf) - self._half_width[:, None]
+        gaps = np.full(points.shape, np.inf)
+        # One other tape at a time: all at once would fill the memory on a large map.
+        for k, half_width in enumerate(self._half_width):
+            seen = (points - self._start[k]) * self._direction[k].conj()
+            beyond = seen.real - np.clip(seen.real, 0.0, self._length[k])
+            gap = np.hypot(beyond, seen.imag) - half_width
+            gap[k] = np.inf
+            np.minimum(gaps, gap, out=gaps)
+        return gaps - self._half_width[:, None]
 
     def _in_base(self, pose: Pose2) -> tuple[Complex, Complex]:
         """Starts and unit directions (L,) of the tapes in base_link, as x + iy."""

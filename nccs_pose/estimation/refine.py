@@ -48,7 +48,6 @@ class Refinement:
     :ivar attitude: height, roll and pitch off the plane (3,); zero where they were held.
     :ivar residual: whitened residuals at the pose (N,).
     :ivar inlier: which pixels the pose rests on (N,).
-    :ivar scale: robust standard deviation of the whitened residuals; 1 when the noise is as told.
     :ivar converged: whether the last step was negligible.
     """
 
@@ -58,7 +57,6 @@ class Refinement:
     attitude: Array
     residual: Array
     inlier: NDArray[np.bool_]
-    scale: float
     converged: bool
 
 
@@ -140,12 +138,11 @@ def refine(
     if information is not None:
         known = information + known
     unknowns = np.concatenate([start.as_array(), expected[3:]])
-    point, scale, converged = _Point(unknowns, *form.residual(unknowns)), 1.0, True
+    point, converged = _Point(unknowns, *form.residual(unknowns)), True
     inlier = np.ones(len(rays), dtype=bool)
     if robust:
         point, converged = _descend(problem, known, point, None, max_iterations)
-        scale = _robust_scale(point.e)
-        inlier = np.abs(point.e) <= _GATE * scale
+        inlier = np.abs(point.e) <= _GATE * _robust_scale(point.e)
     count = int(np.count_nonzero(inlier))
     trusted = inlier.astype(float) if count < len(inlier) else 1.0
     point, finished = _descend(problem, known, point, trusted, max_iterations)
@@ -165,7 +162,7 @@ def refine(
     attitude = point.unknowns[3:] if len(expected) == 6 else np.zeros(3)
     return Refinement(
         Pose2.from_array(point.unknowns[:3]), 0.5 * (covariance + covariance.T), normal[:3, :3],
-        attitude, e, inlier, scale, converged and finished)
+        attitude, e, inlier, converged and finished)
 
 
 def _prior(

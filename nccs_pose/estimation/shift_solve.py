@@ -85,21 +85,8 @@ def solve_shifts(
     rows /= sigma
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
-    sums = np.add.reduceat(rows, first, axis=1) / np.sqrt(members)
-    unknowns: NDArray[np.floating] = np.zeros(len(free))
-    e, scale = sums[-1], 1.0
-    for _ in range(_ITERATIONS):
-        scale = _robust_scale(e)
-        weighed = (sums / (1.0 + np.square(e / (_CAUCHY * scale)))) @ sums.T
-        normal, right = weighed[:-1, :-1], weighed[:-1, -1]
-        normal += known
-        before = unknowns
-        unknowns = definite_solution(normal, right + told)
-        e = sums[-1] - unknowns @ sums[:-1]
-        step = unknowns - before
-        if step @ normal @ step < _FOUND:
-            break
-    trusted = np.abs(e) <= _GATE * _robust_scale(e)
+    unknowns, trusted = _robust(
+        np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
     inlier = trusted.repeat(members)
     inliers = rows[:, inlier]
     squares = inliers @ inliers.T
@@ -121,7 +108,32 @@ def solve_shifts(
     return Refinement(
         Pose2(start.x + unknowns[0], start.y + unknowns[1], start.yaw + unknowns[2]),
         0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
-        _residual(rows, unknowns), inlier, scale, True)
+        _residual(rows, unknowns), inlier, True)
+
+
+def _robust(
+    equations: Array, known: Array, told: Array,
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Re-weighted least squares under Cauchy's loss.
+
+    :param equations: whitened, by unknowns and what they should come to (K + 1, G).
+    :param known: information about the unknowns beforehand (K, K), and times what they are
+        expected to be, ``told`` (K,).
+    :returns: the unknowns (K,), and which equations are inliers (G,).
+    """
+    unknowns: NDArray[np.floating] = np.zeros(len(told))
+    e = equations[-1]
+    for _ in range(_ITERATIONS):
+        weight = 1.0 / (1.0 + np.square(e / (_CAUCHY * _robust_scale(e))))
+        weighed = (equations * weight) @ equations.T
+        normal = weighed[:-1, :-1] + known
+        before = unknowns
+        unknowns = definite_solution(normal, weighed[:-1, -1] + told)
+        e = _residual(equations, unknowns)
+        step = unknowns - before
+        if step @ normal @ step < _FOUND:
+            break
+    return unknowns, np.abs(e) <= _GATE * _robust_scale(e)
 
 
 def _prior(
