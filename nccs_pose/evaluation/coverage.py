@@ -16,9 +16,11 @@
 """Whether the covariance is true, scenario by scenario, on rendered images with their truth.
 
 Every trial is a fresh image of a random pose on a floor of its own, searched from nothing, so that
-errors are independent and the bands of chi-square hold. Where the lines in view do not fix a
-pose, the trial is two images: one that does, and then, an odometry step later, the one in
-question; the wheels err as the localiser expects them to.
+errors are independent and the bands of chi-square hold. What the localiser is told to know only
+so well, the height of its mirror and where asked the slope of the floor, is drawn as uncertain
+as it is told. Where the lines in view do not fix a pose, the trial is two images: one that does,
+and then, an odometry step later, the one in question; the wheels err as the localiser expects
+them to.
 """
 
 from __future__ import annotations
@@ -32,10 +34,11 @@ from typing import Any
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.motion import by_odometry
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, wrap_angle
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Obstacle, Scene
 import numpy as np
@@ -45,6 +48,9 @@ _FRAME_NS = 100_000_000
 # The step of the robot between two images, m, m and rad.
 _MOTION = (0.05, 0.0, 0.03)
 _PEOPLE = 3
+# So many trials share a height and a slope: the renderer's tables of a mounting take longer than
+# an image.
+_SHARED = 20
 
 
 @dataclass(frozen=True)
@@ -55,12 +61,14 @@ class Scenario:
     :ivar scene: what is there.
     :ivar seen: names of the lines that the second image shows; None for all, in a single image.
     :ivar people: how many stand about at random, close to the robot.
+    :ivar tilt: standard deviation of the floor's slope, by roll and by pitch, rad.
     """
 
     name: str
     scene: Callable[[], Scene]
     seen: tuple[str, ...] | None = None
     people: int = 0
+    tilt: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +139,8 @@ SCENARIOS = (
     Scenario('JPEG 50', _ideal(640, 0.02, jpeg_quality=50)),
     Scenario('JPEG 20', _ideal(640, 0.02, jpeg_quality=20)),
     Scenario('people in the way', _ideal(640, 0.02), people=_PEOPLE),
+    Scenario('floor uneven by 0.3 deg', _ideal(640, 0.02), tilt=math.radians(0.3)),
+    Scenario('floor uneven by 0.6 deg', _ideal(640, 0.02), tilt=math.radians(0.6)),
     Scenario('textured arena 1280', _arena(1280)),
     Scenario('textured arena 640', _arena(640)),
     Scenario('textured arena 640, JPEG 30', _arena(640, jpeg_quality=30)),
@@ -146,17 +156,19 @@ def run_scenario(
 ) -> Covered:
     """Play a scenario's trials to one localiser that forgets everything between them."""
     scene = scenario.scene()
-    localiser = Localiser(scene.rig, scene.line_map)
+    options = LocaliserOptions(tilt_sigma=scenario.tilt)
+    localiser = Localiser(scene.rig, scene.line_map, options)
     errors, covariances = [], []
     for k in range(trials):
         rng = np.random.default_rng([seed, k])
         pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (*_SPREAD, np.pi))
+        standing = _standing(scene, options, np.random.default_rng([seed, k // _SHARED, 1]))
         localiser.reset()
         if scenario.seen is None:
-            peopled = _peopled(_fresh_floor(scene, k), scenario.people, pose, rng)
+            peopled = _peopled(_fresh_floor(standing, k), scenario.people, pose, rng)
             estimate = localiser.process(0, render(peopled, pose, rng))
         else:
-            pose, estimate = _second_image(localiser, scene, scenario.seen, pose, rng)
+            pose, estimate = _second_image(localiser, standing, scenario.seen, pose, rng)
         progress(scenario.name)
         if estimate.pose is None or estimate.covariance is None:
             continue
@@ -166,6 +178,15 @@ def run_scenario(
         covariances.append(estimate.covariance)
     return Covered(
         scenario, trials, np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)))
+
+
+def _standing(scene: Scene, options: LocaliserOptions, rng: np.random.Generator) -> Scene:
+    """The same robot, as high and as level as the localiser expects it to stand."""
+    z, roll, pitch = rng.standard_normal(3) * (
+        options.height_sigma, options.tilt_sigma, options.tilt_sigma)
+    off_plane = RigidTransform.from_rpy((roll, pitch, 0.0), (0.0, 0.0, z))
+    return dataclasses.replace(scene, rig=dataclasses.replace(
+        scene.rig, T_base_mirror=off_plane @ scene.rig.T_base_mirror))
 
 
 def _fresh_floor(scene: Scene, seed: int) -> Scene:
