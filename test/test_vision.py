@@ -303,8 +303,8 @@ def _stations(contrast: np.ndarray, n: int = 60) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(6)
     shade = rng.standard_normal((n, 8, 1)) * np.array([3.0, 4.0, 5.0])
     beside = shade + 0.5 * rng.standard_normal((n, 8, 3))
-    clutter = np.einsum('nki,nkj->nij', beside, beside) / 8.0
-    return contrast + rng.standard_normal((n, 3)), np.ones(n), clutter, FLOOR
+    clutter = np.einsum('nki,nkj->ijn', beside, beside) / 8.0
+    return (contrast + rng.standard_normal((n, 3))).T, np.ones(n), clutter, FLOOR
 
 
 def test_the_contrast_and_the_floors_variation_are_learned() -> None:
@@ -337,8 +337,8 @@ def test_no_lesson_makes_a_colour_useless(seed: int) -> None:
     for _ in range(3):
         beside = scale * rng.standard_normal((30, 5, 3))
         colour = colour.learn(
-            scale * rng.standard_normal((30, 3)), rng.random(30),
-            np.einsum('nki,nkj->nij', beside, beside) / 5.0, 200.0 * rng.random(3))
+            scale * rng.standard_normal((3, 30)), rng.random(30),
+            np.einsum('nki,nkj->ijn', beside, beside) / 5.0, 200.0 * rng.random(3))
         assert np.isfinite(colour.discriminant).all()
         assert colour.discriminant @ colour.contrast == pytest.approx(1.0)
 

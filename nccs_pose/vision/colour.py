@@ -93,12 +93,12 @@ class LineColour:
 
         A pose that is wrong shows floor where it expects tape; what it would teach is refused.
 
-        :param height: contrast per station (N, 3).
+        :param height: contrast per station (3, N).
         :param power: its information per unit of noise (N,).
-        :param clutter: covariance of what no profile explains (N, 3, 3), grey levels^2.
+        :param clutter: covariance of what no profile explains (3, 3, N), grey levels^2.
         :param floor: the floor's colour (3,), grey levels.
         """
-        along = height @ self.discriminant
+        along = self.discriminant @ height
         total = float(power.sum())
         mean = float(power @ along) / total
         # Those of mere noise that happen to be positive would pass for a faint tape.
@@ -112,8 +112,8 @@ class LineColour:
             return self
         weight = power * good
         return self.taught(
-            weight @ height / weight.sum(),
-            (good @ clutter.reshape(-1, 9)).reshape(3, 3) / count, floor)
+            height @ weight / weight.sum(),
+            (clutter.reshape(9, -1) @ good).reshape(3, 3) / count, floor)
 
     def taught(self, contrast: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over a contrast (3,) to a floor's colour (3,), unless it is not of this class.

@@ -98,7 +98,7 @@ def profile_products(
     :param s: their place across the curve (N, P), px.
     :param first: station of each group (G,).
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (G, 7, 8); those with D of each station (N, 8); and the floor's colour
+        over each group (7, 8, G); those with D of each station (N, 8); and the floor's colour
         (3,), which the channels are less.
     """
     n, count = s.shape
@@ -106,13 +106,15 @@ def profile_products(
     wide = (half_width / blur).astype(np.float32)[:, None]
     edges = s * np.float32(1.0 / blur) + _SIDES * wide
     square = np.square(edges)
-    # tanh of a cubic is the normal distribution to 0.0003, at a tenth of the cost.
-    rise = square * np.float32(0.0356774)
-    rise += np.float32(0.7978846)
+    # The logistic function of a cubic is the normal distribution to 0.0003.
+    rise = square * np.float32(-0.0713548)
+    rise -= np.float32(1.5957692)
     rise *= edges
-    np.tanh(rise, out=rise)
+    _exponentiate(rise)
+    rise += np.float32(1.0)
+    np.reciprocal(rise, out=rise)
     square *= np.float32(-0.5)
-    steep = np.exp(square, out=square)
+    steep = _exponentiate(square)
     edges *= steep
     rows = np.empty((8, n, count), np.float32)
     np.subtract(rise[0], rise[1], out=rows[0])
@@ -126,6 +128,15 @@ def profile_products(
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
-    scale = np.array([0.5, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    return (np.add.reduceat(products, first, axis=0) * (scale[:7, None] * scale),
+    scale = np.array([1.0, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
+    pooled = np.add.reduceat(products.reshape(n, 56), first, axis=0)
+    return (np.multiply(pooled.T.reshape(7, 8, -1), scale[:7, None, None] * scale[:, None],
+                        order='C'),
             products[:, 1] * (steepness * scale), floor)
+
+
+def _exponentiate(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Exponentials in the place of values of any shape: quicker than numpy's by OpenCV."""
+    flat = values.reshape(1, -1)
+    cv2.exp(flat, flat)
+    return values

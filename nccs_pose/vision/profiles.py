@@ -123,12 +123,11 @@ def fit_profiles(
     groups, count = _Groups.of(bands), s.shape[1]
     pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, groups.first)
     size = count * groups.members
-    means = pooled[:, :, 7] / size[:, None]
-    centred = pooled[:, :, :7] - means[:, :, None] * pooled[:, None, :, 7]
+    means = pooled[:, 7] / size
+    centred = pooled[:, :7] - means[:, None] * pooled[:, 7]
     system = _eliminated(centred)
     if not rough:
-        colour = colour.learn(
-            system.height, system.power, system.left / (size - 4)[:, None, None], floor)
+        colour = colour.learn(system.height, system.power, system.left / (size - 4), floor)
     # Where the grid is finer than the pixels, across or along, each is counted several times.
     repeats = np.maximum(rows / bands.spacing, 1.0) * np.maximum(
         count / rows / (2.0 * (bands.half_width + margin)), 1.0)
@@ -136,12 +135,12 @@ def fit_profiles(
         by_shift, means, system, colour.discriminant, groups, size, bands, repeats)
     # A template beside its tape would take the misfit for blur.
     if not rough and median(np.abs(shared)) < _SHARP_PX:
-        share = centred[:, 3, 0] / system.power
+        share = centred[3, 0] / system.power
         weights = colour.discriminant
         colour = colour.sharpen(
-            system.height @ weights,
-            centred[:, 3, 4:] @ weights - share * (centred[:, 0, 4:] @ weights),
-            centred[:, 3, 3] - share * centred[:, 3, 0])
+            weights @ system.height,
+            weights @ centred[3, 4:] - share * (weights @ centred[0, 4:]),
+            centred[3, 3] - share * centred[3, 0])
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
     return ProfileFit(
@@ -152,13 +151,13 @@ class _System(NamedTuple):
     """The normal equations of G groups after elimination: contrast, floor's slope, shift.
 
     :ivar power: of T (G,).
-    :ivar height: contrast of each channel (G, 3).
+    :ivar height: contrast of each channel (3, G).
     :ivar by_shift: what a unit of D has of T (G,).
     :ivar by_slope: what a unit of s has of T (G,).
-    :ivar slope_power, slope: what is left of s, and of its products with the channels (G, 3).
+    :ivar slope_power, slope: what is left of s, and of its products with the channels (3, G).
     :ivar own_power, own: what is left of D beside T, likewise.
     :ivar crossed: product of the two (G,).
-    :ivar left: products of the channels with each other that no template explains (G, 3, 3).
+    :ivar left: products of the channels with each other that no template explains (3, 3, G).
     """
 
     power: Array
@@ -174,21 +173,24 @@ class _System(NamedTuple):
 
 
 def _eliminated(products: Array) -> _System:
-    """Eliminate T from the rest, and all three from the channels."""
-    power = np.maximum(products[:, 0, 0], 1e-9)
-    shares = products[:, :, 0] / power[:, None]
-    rest = products - shares[:, :, None] * products[:, :1, :]
-    slope_power = np.maximum(rest[:, 2, 2], 1e-9)
-    own_power = np.maximum(rest[:, 1, 1], 1e-9)
-    crossed, slope, own = rest[:, 1, 2], rest[:, 2, 4:], rest[:, 1, 4:]
+    """Eliminate T from the rest, and all three from the channels.
+
+    :param products: of T, D, s, B and the channels with each other (7, 7, G).
+    """
+    power = np.maximum(products[0, 0], 1e-9)
+    shares = products[0] / power
+    rest = products - shares[:, None] * products[0]
+    slope_power = np.maximum(rest[2, 2], 1e-9)
+    own_power = np.maximum(rest[1, 1], 1e-9)
+    crossed, slope, own = rest[1, 2], rest[2, 4:], rest[1, 4:]
     share = crossed / slope_power
-    alone = own - share[:, None] * slope
+    alone = own - share * slope
     alone_power = np.maximum(own_power - share * crossed, 1e-9)
-    left = (rest[:, 4:, 4:] - slope[:, :, None] * (slope / slope_power[:, None])[:, None]
-            - alone[:, :, None] * (alone / alone_power[:, None])[:, None])
+    left = (rest[4:, 4:] - slope[:, None] * (slope / slope_power)
+            - alone[:, None] * (alone / alone_power))
     return _System(
-        power, shares[:, 4:], shares[:, 1], shares[:, 2], slope_power, slope, own_power, own,
-        crossed, left)
+        power, shares[4:], shares[1], shares[2], slope_power, slope, own_power, own, crossed,
+        left)
 
 
 def _shifts(
@@ -198,14 +200,15 @@ def _shifts(
     """Shifts and their noise along a colour's discriminant.
 
     :param by_shift: products of the stations with D (N, 8).
-    :param means: of T, D, s, B and the channels over each group (G, 7).
+    :param means: of T, D, s, B and the channels over each group (7, G).
     :param weights: the discriminant (3,).
     :param size: samples of each group (G,).
     :param repeats: how often each pixel is among a station's samples (N,).
     :returns: the stations' fit, and the shift of each group as a whole (G,), px.
     """
-    power, slope = system.power, system.slope @ weights
-    variance = np.maximum((system.left @ weights) @ weights / (size - 4), 1e-12)
+    power, slope, first = system.power, weights @ system.slope, groups.first
+    variance = np.maximum(
+        np.outer(weights, weights).ravel() @ system.left.reshape(9, -1) / (size - 4), 1e-12)
     usual = median(variance)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
@@ -215,12 +218,12 @@ def _shifts(
     belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
     share = belief * system.crossed / system.slope_power
     shift_power = np.maximum(system.own_power - share * system.crossed, 1e-9)
-    variance = variance * repeats[groups.first]
-    moved = (system.own @ weights - share * slope) / shift_power
-    a = system.height @ weights - system.by_shift * moved
+    variance *= repeats.take(first)
+    moved = (weights @ system.own - share * slope) / shift_power
+    a = weights @ system.height - system.by_shift * moved
     told = power / variance
-    label = bands.label[groups.first]
-    level, certain = _levels(label, a, power, told, 2.0 * bands.half_width[groups.first])
+    level, certain = _levels(
+        bands.label.take(first), a, power, told, 2.0 * bands.half_width.take(first))
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One group's contrast is noisy where the tape is thin; its neighbours know better.
     prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
@@ -229,15 +232,17 @@ def _shifts(
     # weighted mean over the group is the group's own shift.
     tilt = belief * (slope - system.crossed * moved) / system.slope_power
     height = a - system.by_slope * tilt
-    base = means[:, 4:] @ weights - height * means[:, 0] - moved * means[:, 1] - tilt * means[:, 2]
-    of = groups.number
+    base = weights @ means[4:] - height * means[0] - moved * means[1] - tilt * means[2]
     own_power = np.maximum(by_shift[:, 1], 1e-9)
-    own = (by_shift[:, 4:7] @ weights - height[of] * by_shift[:, 0]
-           - tilt[of] * by_shift[:, 2] - base[of] * by_shift[:, 7])
-    part = own_power / np.add.reduceat(own_power, groups.first)[of]
-    sigma = np.sqrt(variance[of] / (part * shift_power[of])) / smooth[of]
+    told_by_own = np.add.reduceat(own_power, first) / (shift_power * np.square(smooth))
+    # By columns: T, s and 1 of each station's group, its scale and its noise.
+    of = np.stack([height, tilt, base, smooth, variance * told_by_own]).take(
+        groups.number, axis=1)
+    own = (by_shift[:, 4:7] @ weights - of[0] * by_shift[:, 0] - of[1] * by_shift[:, 2]
+           - of[2] * by_shift[:, 7])
     return ProfileFit(
-        own / own_power / smooth[of], sigma, found[of], of), moved / smooth
+        own / (own_power * of[3]), np.sqrt(of[4] / own_power), found.take(groups.number),
+        groups.number), moved / smooth
 
 
 def median(values: Array) -> float:
