@@ -22,7 +22,7 @@ import math
 
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
-from nccs_pose.geometry.small_matrices import definite_solution
+from nccs_pose.geometry.small_matrices import solution
 import numpy as np
 
 # Signs of the contrast (tape minus floor) in B, G, R of each class that a map may name.
@@ -85,7 +85,7 @@ class LineColour:
     @cached_property
     def discriminant(self) -> Array:
         """Fisher's weights (3,) on B, G, R, scaled so that the tape's contrast is 1."""
-        weights = definite_solution(self.clutter, self.contrast)
+        weights = solution(self.clutter, self.contrast)
         return weights / float(weights @ self.contrast)
 
     def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:
@@ -105,8 +105,9 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter @ scatter)) / total:
             return self
-        middle = len(along) // 2
-        good = along > 0.3 * max(float(np.partition(along, middle)[middle]), 0.0)
+        ordered, middle = along.copy(), len(along) // 2
+        ordered.partition(middle)
+        good = along > 0.3 * max(float(ordered[middle]), 0.0)
         count = np.count_nonzero(good)
         if count < 10:
             return self
@@ -122,7 +123,7 @@ class LineColour:
         """
         if self._unlike(contrast, floor) or float(contrast @ contrast) < _LEAST_CONTRAST**2:
             return self
-        return replace(self, contrast=contrast, clutter=clutter + _ROUNDING)
+        return LineColour(self.name, contrast, clutter + _ROUNDING, self.blur)
 
     def _unlike(self, contrast: Array, floor: Array) -> bool:
         """Whether a contrast (3,) to a floor's colour (3,) is another class's.
@@ -130,12 +131,13 @@ class LineColour:
         Relative to the floor, which takes out exposure and white balance; and for a coloured tape
         less the brightness, which tells nothing of its hue.
         """
-        relative = contrast / np.maximum(floor, 1.0)
-        nominal = np.array(CONTRASTS[self.name])
+        relative = [c / max(f, 1.0) for c, f in zip(contrast.tolist(), floor.tolist())]
+        nominal = CONTRASTS[self.name]
         if self._coloured:
-            relative = relative - relative.sum() / 3.0
-        size = math.sqrt(float(relative @ relative) * float(nominal @ nominal))
-        return float(relative @ nominal) < _DRIFT_COSINE * size or size == 0.0
+            brightness = sum(relative) / 3.0
+            relative = [value - brightness for value in relative]
+        size = math.hypot(*relative) * math.hypot(*nominal)
+        return sum(r * n for r, n in zip(relative, nominal)) < _DRIFT_COSINE * size or size == 0.0
 
     @property
     def _coloured(self) -> bool:

@@ -129,10 +129,12 @@ def fit_profiles(
     if not rough:
         colour = colour.learn(system.height, system.power, system.left / (size - 4), floor)
     # Where the grid is finer than the pixels, across or along, each is counted several times.
-    repeats = np.maximum(rows / bands.spacing, 1.0) * np.maximum(
-        count / rows / (2.0 * (bands.half_width + margin)), 1.0)
+    half_width = bands.half_width.take(groups.first)
+    repeats = np.maximum(rows / bands.spacing.take(groups.first), 1.0) * np.maximum(
+        0.5 * count / rows / (half_width + margin), 1.0)
     fit, shared = _shifts(
-        by_shift, means, system, colour.discriminant, groups, size, bands, repeats)
+        by_shift, means, system, colour.discriminant, groups, size, repeats,
+        bands.label.take(groups.first), half_width)
     # A template beside its tape would take the misfit for blur.
     if not rough and median(np.abs(shared)) < _SHARP_PX:
         share = centred[3, 0] / system.power
@@ -195,7 +197,7 @@ def _eliminated(products: Array) -> _System:
 
 def _shifts(
     by_shift: Array, means: Array, system: _System, weights: Array, groups: _Groups,
-    size: NDArray[np.intp], bands: Bands, repeats: Array,
+    size: NDArray[np.intp], repeats: Array, label: NDArray[np.intp], half_width: Array,
 ) -> tuple[ProfileFit, Array]:
     """Shifts and their noise along a colour's discriminant.
 
@@ -203,12 +205,14 @@ def _shifts(
     :param means: of T, D, s, B and the channels over each group (7, G).
     :param weights: the discriminant (3,).
     :param size: samples of each group (G,).
-    :param repeats: how often each pixel is among a station's samples (N,).
+    :param repeats: how often each pixel is among the samples of a group (G,).
+    :param label: line of each group (G,), ascending.
+    :param half_width: of its tape (G,), px.
     :returns: the stations' fit, and the shift of each group as a whole (G,), px.
     """
-    power, slope, first = system.power, weights @ system.slope, groups.first
-    variance = np.maximum(
-        np.outer(weights, weights).ravel() @ system.left.reshape(9, -1) / (size - 4), 1e-12)
+    power, slope, first, of = system.power, weights @ system.slope, groups.first, groups.number
+    squares = (weights[:, None] * weights).ravel()
+    variance = np.maximum(squares @ system.left.reshape(9, -1) / (size - 4), 1e-12)
     usual = median(variance)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
@@ -218,53 +222,50 @@ def _shifts(
     belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
     share = belief * system.crossed / system.slope_power
     shift_power = np.maximum(system.own_power - share * system.crossed, 1e-9)
-    variance *= repeats.take(first)
+    variance *= repeats
     moved = (weights @ system.own - share * slope) / shift_power
     a = weights @ system.height - system.by_shift * moved
     told = power / variance
-    level, certain = _levels(
-        bands.label.take(first), a, power, told, 2.0 * bands.half_width.take(first))
+    level, certain = _levels(label, a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One group's contrast is noisy where the tape is thin; its neighbours know better.
     prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
     smooth = np.maximum((a * told + level * prior) / (told + prior), 1e-9)
     # What each station's pixels say to D beside the floor and the contrast of its group; the
     # weighted mean over the group is the group's own shift.
-    tilt = belief * (slope - system.crossed * moved) / system.slope_power
+    tilt = belief * slope / system.slope_power - share * moved
     height = a - system.by_slope * tilt
     base = weights @ means[4:] - height * means[0] - moved * means[1] - tilt * means[2]
+    own = (by_shift[:, 4:7] @ weights - height[of] * by_shift[:, 0] - tilt[of] * by_shift[:, 2]
+           - base[of] * by_shift[:, 7])
     own_power = np.maximum(by_shift[:, 1], 1e-9)
-    told_by_own = np.add.reduceat(own_power, first) / (shift_power * np.square(smooth))
-    # By columns: T, s and 1 of each station's group, its scale and its noise.
-    of = np.stack([height, tilt, base, smooth, variance * told_by_own]).take(
-        groups.number, axis=1)
-    own = (by_shift[:, 4:7] @ weights - of[0] * by_shift[:, 0] - of[1] * by_shift[:, 2]
-           - of[2] * by_shift[:, 7])
+    noise = variance * np.add.reduceat(own_power, first) / (shift_power * np.square(smooth))
     return ProfileFit(
-        own / (own_power * of[3]), np.sqrt(of[4] / own_power), found.take(groups.number),
-        groups.number), moved / smooth
+        own / (own_power * smooth[of]), np.sqrt(noise[of] / own_power), found[of], of
+    ), moved / smooth
 
 
 def median(values: Array) -> float:
     """The middle one of some values (N,), the upper one of two."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])
+    ordered, middle = values.copy(), len(values) // 2
+    ordered.partition(middle)
+    return float(ordered[middle])
 
 
 def _levels(
-    label: NDArray[np.intp], a: Array, weight: Array, told: Array, width: Array,
+    label: NDArray[np.intp], a: Array, weight: Array, told: Array, half_width: Array,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Each station's expected contrast, its line's weighted median, and whether that is sure.
 
     :param label: line (N,), ascending.
-    :param width: of the tape (N,), px.
+    :param half_width: of the tape (N,), px.
     """
     first, count = runs(label)
     order = np.lexsort((a, label))
-    total = np.cumsum(weight[order])
-    half = total[first + count - 1] - 0.5 * np.add.reduceat(weight, first)
-    level = a[order[np.searchsorted(total, half)]]
+    total = weight.take(order).cumsum()
+    half = total.take(first + count - 1) - 0.5 * np.add.reduceat(weight, first)
+    level = a.take(order.take(total.searchsorted(half)))
     # Far stations are faint one by one, but a whole line of them is not.
     certain = (level * np.sqrt(np.add.reduceat(told, first)) > FOUND) & (
-        level > _FAINT * np.minimum(1.0, np.add.reduceat(width, first) / count))
+        level > _FAINT * np.minimum(1.0, 2.0 * np.add.reduceat(half_width, first) / count))
     return np.where(certain, level, 1e-9).repeat(count), certain.repeat(count)
