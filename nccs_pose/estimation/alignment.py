@@ -80,6 +80,9 @@ class Alignment:
     :ivar points: the pixels it rests on, labelled by map line.
     :ivar residual: of the points, whitened (N,).
     :ivar noise: of the image, by which they are whitened (N,), px.
+    :ivar scale: root mean square residual, as a multiple of the noise.
+    :ivar residual_px: the same in px.
+    :ivar expected_px: what the noise makes of it, px.
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
     :ivar missing: map lines that should be seen plainly and are not there.
@@ -95,6 +98,9 @@ class Alignment:
     points: LinePoints
     residual: Array
     noise: Array
+    scale: float
+    residual_px: float
+    expected_px: float
     explained: float
     lines: tuple[int, ...]
     missing: tuple[int, ...]
@@ -250,7 +256,7 @@ class Aligner:
         if len(bands) < _LEAST_STATIONS:
             return None
         fit, colours = self._fit(image, bands, colours, rough)
-        used = np.flatnonzero(fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma))
+        used, = (fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)).nonzero()
         if len(used) < _LEAST_STATIONS:
             return None
         if not rough and float(bands.spacing.take(used).sum()) < _LEAST_LENGTH:
@@ -268,22 +274,25 @@ class Aligner:
 def _alignment(measured: _Measured, lines: int) -> Alignment:
     """What a last pass over a map of so many lines comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
-    index = measured.used[refinement.inlier]
+    inlier, = refinement.inlier.nonzero()
+    index = measured.used.take(inlier)
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.
     worth = bands.spacing * np.minimum(1.0, bands.half_width)
-    residual = refinement.residual[refinement.inlier]
+    residual = refinement.residual.take(inlier)
     sigma, label = fit.sigma.take(index), bands.label.take(index)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, members = runs(fit.group.take(index))
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
     misfit = common_misfit(
-        np.add.reduceat(residual, first) / np.sqrt(members), together, label[first])
+        np.add.reduceat(residual, first) / np.sqrt(members), together, label.take(first))
+    scale = root_mean_square(residual)
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
-        LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
+        LinePoints(pixels, scale * sigma, label), residual, sigma, scale,
+        root_mean_square(residual * sigma), root_mean_square(sigma),
         float(worth.take(index).sum() / worth.sum()),
-        tuple(np.flatnonzero(there).tolist()), _missing(bands, index),
+        tuple(there.nonzero()[0].tolist()), _missing(bands, index),
         there / np.where(seen > 0, seen, np.nan), misfit, measured.colours)
 
 
@@ -292,7 +301,7 @@ def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
     plain = bands.spacing * (2.0 * bands.half_width >= _PLAIN_WIDTH)
     seen = np.bincount(bands.label, plain)
     there = np.bincount(bands.label.take(found), plain.take(found), minlength=len(seen))
-    return tuple(np.flatnonzero((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).tolist())
+    return tuple(((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).nonzero()[0].tolist())
 
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:

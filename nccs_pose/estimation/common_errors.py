@@ -78,7 +78,7 @@ def common_misfit(residual: Array, sigma: Array, label: NDArray[np.intp]) -> flo
     # Blocks go from each line's start; what is left at its end is in none.
     whole = count // _BLOCK
     blocks = int(whole.sum())
-    begin = (start - _BLOCK * (np.cumsum(whole) - whole)).repeat(whole)
+    begin = (start - _BLOCK * (whole.cumsum() - whole)).repeat(whole)
     member = (begin + _BLOCK * np.arange(blocks))[:, None] + np.arange(_BLOCK)
     in_px = (residual * sigma)[member]
     # Beyond what independent errors of this size give the blocks' means.

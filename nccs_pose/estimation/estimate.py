@@ -16,16 +16,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from nccs_pose.estimation.common_errors import root_mean_square
-from nccs_pose.estimation.observability import Unobserved
-from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.line_points import LinePoints
-import numpy as np
 
 
 class State(Enum):
@@ -105,25 +100,6 @@ class Quality:
     claimed: float = float('nan')
     ambiguity: float = 0.0
     unobserved: tuple[str, ...] = ()
-
-
-def quality_of(
-    refinement: Refinement, points: LinePoints, explained: float, claimed: float,
-    ambiguity: float, unobserved: Sequence[Unobserved],
-) -> Quality:
-    """The signals of health of a pose.
-
-    :param refinement: the solve that gave it.
-    :param points: its inlying pixels, with their sigma as it turned out.
-    """
-    sigma = points.sigma
-    residual = refinement.residual[refinement.inlier]
-    told = sigma / max(root_mean_square(residual), 1e-9)
-    return Quality(
-        lines_used=int(np.count_nonzero(np.bincount(points.label))), points_used=len(points),
-        residual_px=root_mean_square(residual * told), expected_px=root_mean_square(told),
-        explained=explained, claimed=claimed, ambiguity=ambiguity,
-        unobserved=tuple(u.words for u in unobserved))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ cannot be trusted is not given.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 import time
 
@@ -32,7 +33,7 @@ from nccs_pose.estimation.estimate import (
     Candidate,
     Doubted,
     Estimate,
-    quality_of,
+    Quality,
     StageTimes,
     State,
 )
@@ -53,7 +54,7 @@ from nccs_pose.estimation.judge import (
     settled_doubts,
 )
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
-from nccs_pose.estimation.observability import unobserved_directions
+from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sifting import Refused, Sifter
@@ -146,6 +147,8 @@ class Localiser:
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
+        # Where the wheels say that the robot was at the image in hand (T_odom_base).
+        self._now: Pose2 | None = None
         # Poses among which no image has decided yet, and where the wheels were then.
         self._open: tuple[Hypothesis, ...] = ()
         self._open_odometry: Pose2 | None = None
@@ -183,6 +186,7 @@ class Localiser:
             self._odometry.clear()
             self.relocalise()
         watch = _Stopwatch()
+        self._now = self._odometry.at(stamp_ns)
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
         refused = Refused()
@@ -198,9 +202,8 @@ class Localiser:
         track, before = self._track, self._before
         if track is None:
             return None
-        now = self._odometry.at(stamp_ns)
-        if track.odometry is not None and now is not None:
-            return by_odometry(track.pose, track.covariance, track.odometry, now)
+        if track.odometry is not None and self._now is not None:
+            return by_odometry(track.pose, track.covariance, track.odometry, self._now)
         return by_velocity(before, track, stamp_ns)
 
     def _follow(
@@ -248,8 +251,7 @@ class Localiser:
         refused: Refused, watch: _Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
-        now = self._odometry.at(stamp_ns)
-        hypotheses = carried(self._open, self._open_odometry, now)
+        hypotheses = carried(self._open, self._open_odometry, self._now)
         refusals: list[Refused] = []
         for sight in sights(
                 image, self._searcher, self._fresh_colours(), self._in_vain, watch.lap):
@@ -288,7 +290,7 @@ class Localiser:
         hypotheses = (hypotheses[0], *sorted(others, key=lambda h: -h.mean))
         if lines_used(held[0].alignment) < 3:
             hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-        self._open, self._open_odometry = hypotheses, now
+        self._open, self._open_odometry = hypotheses, self._now
         best = hypotheses[0]
         if ambiguity(hypotheses) <= self.options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
@@ -341,7 +343,7 @@ class Localiser:
         # No velocity leads across a jump.
         self._before = None if self._open else self._track
         self._track = Track(
-            stamp_ns, alignment.pose, covariance, self._odometry.at(stamp_ns), seen_ns)
+            stamp_ns, alignment.pose, covariance, self._now, seen_ns)
         self._colours = alignment.colours
         self._prior = None
         self._open, self._open_odometry = (), None
@@ -350,9 +352,8 @@ class Localiser:
         self._shown = shown if prior is None else self._shown | shown
         self._ever_tracked = True
         ranked = held or [found]
-        quality = quality_of(
-            alignment.refinement, alignment.points, alignment.explained, found.claimed,
-            ranked[1].score / ranked[0].score if len(ranked) > 1 else 0.0, unobserved)
+        quality = _quality(
+            found, ranked[1].score / ranked[0].score if len(ranked) > 1 else 0.0, unobserved)
         watch.lap('refine')
         return Estimate(
             stamp_ns, State.TRACKING, reason, alignment.pose, covariance,
@@ -364,9 +365,7 @@ class Localiser:
         hypotheses = self._open
         poses = tuple(Candidate(h.pose, h.mean) for h in hypotheses)
         ratio = ambiguity(hypotheses)
-        best = held[0].alignment
-        quality = quality_of(
-            best.refinement, best.points, best.explained, held[0].claimed, ratio, ())
+        quality = _quality(held[0], ratio)
         if ratio > self.options.ambiguity_ratio:
             state, words = State.AMBIGUOUS, (
                 f'{len(poses)} poses explain the image about equally well (the second scores '
@@ -413,6 +412,16 @@ class Localiser:
         _, claimed = self._searcher.score(prediction.pose, segments)
         foreign = (1.0 - claimed) * sum(strip.weight for strip in segments)
         return claimed < _CLAIMED and foreign > _FOREIGN * self._table.rig.camera.width
+
+
+def _quality(found: Found, ambiguity: float, unobserved: Sequence[Unobserved] = ()) -> Quality:
+    """The signals of health of a pose."""
+    alignment = found.alignment
+    return Quality(
+        lines_used=len(alignment.lines), points_used=len(alignment.points),
+        residual_px=alignment.residual_px, expected_px=alignment.expected_px,
+        explained=alignment.explained, claimed=found.claimed, ambiguity=ambiguity,
+        unobserved=tuple(u.words for u in unobserved))
 
 
 def _what_is_missing(segments: tuple[FloorSegment, ...]) -> str:

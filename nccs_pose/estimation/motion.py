@@ -171,8 +171,12 @@ def _carried(
 ) -> Array:
     """Covariance (3, 3) after a step: an error in yaw swings the step sideways."""
     moved = pose @ step
-    jacobian = np.array([
-        [1.0, 0.0, pose.y - moved.y], [0.0, 1.0, moved.x - pose.x], [0.0, 0.0, 1.0]])
-    carried = jacobian @ covariance @ jacobian.T
-    carried.flat[::4] += sigma**2, sigma**2, sigma_yaw**2
-    return carried
+    # How the place goes as the yaw does.
+    a, b = pose.y - moved.y, moved.x - pose.x
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
+    across_x, across_y = xt + a * tt, yt + b * tt
+    mixed = xy + a * yt + b * across_x
+    return np.array([
+        [xx + a * (xt + across_x) + sigma**2, mixed, across_x],
+        [mixed, yy + b * (yt + across_y) + sigma**2, across_y],
+        [across_x, across_y, tt + sigma_yaw**2]])

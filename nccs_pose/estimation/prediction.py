@@ -83,8 +83,10 @@ class BandPredictor:
         self._left = as_points(1j * self._direction)
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        self._distance = np.linspace(0.0, self._length, _COARSE, axis=1)
-        self._slope = _SLOPE * np.arange(self._distance.size)
+        distance = np.linspace(0.0, self._length, _COARSE, axis=1)
+        self._samples = (self._start[:, None] + distance * self._direction[:, None]).ravel()
+        self._distance = distance.ravel()
+        self._slope = _SLOPE * np.arange(distance.size)
         self._gap = self._gaps().ravel()
 
     def places(
@@ -98,9 +100,8 @@ class BandPredictor:
         :param lines: of the map that get any; None for all.
         """
         tapes = len(self._lines)
-        origin, along = self._in_base(pose)
         pixels = self._table.pixels(as_points(
-            origin[:, None] + self._distance * along[:, None]))
+            (self._samples - complex(pose.x, pose.y)) * _turned_back(pose)))
         visible, curve = self._table.sees_floor(pixels), as_complex(pixels)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
@@ -109,19 +110,19 @@ class BandPredictor:
         steps *= visible[1:] & visible[:-1]
         steps[_COARSE - 1::_COARSE] = 0.0
         axis = np.zeros(len(curve))
-        np.cumsum(steps, out=axis[1:])
+        steps.cumsum(out=axis[1:])
         begin = axis[::_COARSE]
         length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
         count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
         if lines is not None:
             count[~np.isin(self._lines, list(lines))] = 0
         number = np.arange(tapes).repeat(count)
-        first = np.cumsum(count) - count
+        first = count.cumsum() - count
         each = length / np.maximum(count, 1)
         spacing_px = each.take(number)
         where = np.arange(0.5, len(number)) * spacing_px + (
             begin + _END - first * each).take(number)
-        distance = np.interp(where, axis + self._slope, self._distance.ravel())
+        distance = np.interp(where, axis + self._slope, self._distance)
         return Places(number, distance, spacing_px)
 
     def bands(
@@ -136,10 +137,11 @@ class BandPredictor:
             plane.
         """
         number, distance = places.number, places.distance
-        origin, along = self._in_base(pose)
-        ahead_of = along.take(number)
+        turn = _turned_back(pose)
+        origin = (self._start - complex(pose.x, pose.y)) * turn
+        ahead_of = (self._direction * turn).take(number)
         middle = origin.take(number) + distance * ahead_of
-        if attitude.any():
+        if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
         image = self._table.expand(as_points(middle))
         behind_of = ahead_of.conj()
@@ -170,7 +172,7 @@ class BandPredictor:
         gap = self._gap.take(
             number * _GAPS + (distance * (_GAPS / length)).astype(np.intp), mode='clip')
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
-                & (distance > reach) & (distance < length - reach))
+                & (np.minimum(distance, length - distance) > reach))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number))
         slide = np.empty((6, len(number))).T
@@ -201,10 +203,10 @@ class BandPredictor:
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width[:, None]
 
-    def _in_base(self, pose: Pose2) -> tuple[Complex, Complex]:
-        """Starts and unit directions (L,) of the tapes in base_link, as x + iy."""
-        turn = complex(math.cos(pose.yaw), -math.sin(pose.yaw))
-        return (self._start - complex(pose.x, pose.y)) * turn, self._direction * turn
+
+def _turned_back(pose: Pose2) -> complex:
+    """What turns directions of the map, as x + iy, into those of base_link."""
+    return complex(math.cos(pose.yaw), -math.sin(pose.yaw))
 
 
 def _leant(points: Array, attitude: Array) -> tuple[Array, Array]:

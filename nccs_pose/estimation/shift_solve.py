@@ -41,7 +41,8 @@ _ITERATIONS = 8
 # pose, moves no group's residual by as much as a tenth of its own.
 _FOUND = 0.1
 # Where the lines say nothing the pose is still somewhere within 100 m and 10 rad.
-_VAGUE = np.array([1e-4, 1e-4, 1e-2, 0.0, 0.0, 0.0])
+_VAGUE = np.diag([1e-4, 1e-4, 1e-2])
+_ONE = np.eye(6)
 
 
 def solve_shifts(
@@ -77,9 +78,7 @@ def solve_shifts(
     :param image_shift: d(shift)/d(u, v) of the whole image (N, 2).
     :param calibration_sigma: what the calibration may shift the whole image by, px.
     """
-    free, known, expected = _prior(start, prior, attitude_sigma)
-    told = known @ expected
-    known.flat[::len(free) + 1] += _VAGUE[free]
+    free, known, told = _prior(start, prior, attitude_sigma)
     rows = np.empty((len(free) + 1, len(shift)))
     rows[:-1], rows[-1] = slide.T[free], shift
     rows /= sigma
@@ -97,16 +96,17 @@ def solve_shifts(
     inflation = correlation * _inflation(e, len(free))
     unknowns = definite_solution(normal / inflation + known, right / inflation + told)
     inflation = correlation * _inflation(_residual(inliers, unknowns), len(free))
-    covariance = definite_solution(normal / inflation + known, np.eye(len(free)))
+    covariance = definite_solution(
+        normal / inflation + known, _ONE[:len(free), :len(free)])
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
         answer = covariance @ (inliers[:-1] @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
-    attitude = np.zeros(3)
-    for unknown, value in zip(free[3:], unknowns[3:].tolist()):
+    (x, y, yaw, *others), attitude = unknowns.tolist(), np.zeros(3)
+    for unknown, value in zip(free[3:], others):
         attitude[unknown - 3] = value
     return Refinement(
-        Pose2(start.x + unknowns[0], start.y + unknowns[1], start.yaw + unknowns[2]),
+        Pose2(start.x + x, start.y + y, start.yaw + yaw),
         0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
         _residual(rows, unknowns), inlier, True)
 
@@ -124,7 +124,9 @@ def _robust(
     unknowns: NDArray[np.floating] = np.zeros(len(told))
     e = equations[-1]
     for _ in range(_ITERATIONS):
-        weight = 1.0 / (1.0 + np.square(e / (_CAUCHY * _robust_scale(e))))
+        square = e * e
+        width = _CAUCHY**2 * _robust_variance(square)
+        weight = width / (width + square)
         weighed = (equations * weight) @ equations.T
         normal = weighed[:-1, :-1] + known
         before = unknowns
@@ -133,22 +135,28 @@ def _robust(
         step = unknowns - before
         if step @ normal @ step < _FOUND:
             break
-    return unknowns, np.abs(e) <= _GATE * _robust_scale(e)
+    square = e * e
+    return unknowns, square <= _GATE**2 * _robust_variance(square)
 
 
 def _prior(
     start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
 ) -> tuple[list[int], Array, Array]:
-    """Free unknowns, the information about them, and their expected step from the start."""
+    """Free unknowns, the information about them (K, K), and that times their expected step (K,).
+
+    The step is from the start; what is merely vague expects none.
+    """
     height, tilt = attitude_sigma
     free = [0, 1, 2] + ([3] if height > 0.0 else []) + ([4, 5] if tilt > 0.0 else [])
-    information, expected = np.zeros((len(free), len(free))), np.zeros(len(free))
+    information, told = np.zeros((len(free), len(free))), np.zeros(len(free))
+    information[:3, :3] = _VAGUE
     if prior is not None:
-        information[:3, :3] = inverse(prior[1])
-        expected[:3] = prior[0].minus(start)
+        known = inverse(prior[1])
+        information[:3, :3] += known
+        told[:3] = known @ prior[0].minus(start)
     for place, unknown in enumerate(free[3:], start=3):
         information[place, place] = (height if unknown == 3 else tilt) ** -2.0
-    return free, information, expected
+    return free, information, told
 
 
 def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
@@ -162,6 +170,6 @@ def _inflation(residual: Array, unknowns: int) -> float:
     return max(1e-6, float(residual @ residual) / (_WITHIN_GATE * degrees))
 
 
-def _robust_scale(e: Array) -> float:
-    """Standard deviation of the bulk of whitened residuals, never below the noise told."""
-    return max(1.0, 1.4826 * median(np.abs(e)))
+def _robust_variance(square: Array) -> float:
+    """Of the bulk of whitened residuals by their squares (N,), never below the noise told."""
+    return max(1.0, 1.4826**2 * median(square))

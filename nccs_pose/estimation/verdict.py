@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
-from nccs_pose.estimation.common_errors import root_mean_square
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
@@ -85,7 +84,7 @@ def objection(
             f'{_name(line_map, k)} lies {abs(mean[k]):.1f} px off: the rig or the map does not '
             'fit the image', line=k)
     used = lines_used(alignment)
-    scale, size = _misfits(alignment)
+    scale, size = alignment.scale, alignment.residual_px
     times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
     if scale > times and size > least and (used < 4 or not expected):
         return Objection(
@@ -100,15 +99,9 @@ def objection(
 
 def is_weak(alignment: Alignment) -> bool:
     """Whether a pose rests on so little, or fits so badly, that it has to be where expected."""
-    scale, size = _misfits(alignment)
+    scale, size = alignment.scale, alignment.residual_px
     times, least = _UNLIKE_NOISE[1]
     return lines_used(alignment) < 3 or (scale > times and size > least)
-
-
-def _misfits(alignment: Alignment) -> tuple[float, float]:
-    """Root mean square residual, as a multiple of the noise of the image and in px."""
-    return (root_mean_square(alignment.residual),
-            root_mean_square(alignment.residual * alignment.noise))
 
 
 def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:

@@ -52,14 +52,14 @@ _AT_KNOT = np.array([[1.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [6.0, -12.0, 6.0]]) / 6.
 Complex = NDArray[np.complex128]
 
 
-def _weights(t: Array) -> Array:
-    """Weights of the four coefficients about places (K,) between knots (4, K)."""
-    powers = np.empty((4, len(t)))
+def _weights(at: Array, cell: NDArray[np.intp]) -> Array:
+    """Weights of the four coefficients about places (2, N) after the knots before (4, 2, N)."""
+    powers = np.empty((4, *at.shape))
     powers[0] = 1.0
-    powers[1] = t
+    t = np.subtract(at, cell, out=powers[1])
     np.multiply(t, t, out=powers[2])
     np.multiply(powers[2], t, out=powers[3])
-    return _BASIS.T @ powers
+    return (_BASIS.T @ powers.reshape(4, -1)).reshape(powers.shape)
 
 
 def _filtered(values: Complex) -> Complex:
@@ -120,6 +120,8 @@ class FloorTable:
                 f'the mirror at height {self.height} m does not stand over a floor')
         self._last_angle = math.atan2(1.02 * reach, self.height)
         self._foot = complex(*self.foot)
+        self._knots_per_radian = np.array(
+            [[_ANGLES / self._last_angle], [_AZIMUTHS / (2.0 * np.pi)]])
         spline = self._forward()
         rows, self._columns = spline.shape
         self._last_row = rows - 2.0 - 1e-9
@@ -131,6 +133,9 @@ class FloorTable:
         # All that lies outside comes to lie on the frame round it.
         self._sees_floor = np.pad(self.region > 0, 1)
         self._beyond = np.array([rig.camera.width, rig.camera.height], dtype=float)
+        # From one pixel to the next, right and down, and where the first one is.
+        self._apart = np.array([1.0, rig.camera.width + 2.0])
+        self._first = rig.camera.width + 3.0
 
     def _forward(self) -> Complex:
         """Spline coefficients of the pixels over (angle from the nadir, azimuth from -pi)."""
@@ -271,18 +276,18 @@ class FloorTable:
         at = self._places(offset, radius)
         cell = at.astype(np.intp)
         first = cell[0] * self._columns + cell[1]
-        at -= cell
-        by_one = _weights(at.ravel()).reshape(4, 2, -1)
+        by_one = _weights(at, cell)
         weights = (by_one[:, None, 0] * by_one[None, :, 1]).reshape(16, -1).T
-        around = coefficients.take(first[:, None] + self._taps, axis=0)
+        # No index is out of range; 'clip' only spares a check.
+        around = coefficients.take(first[:, None] + self._taps, axis=0, mode='clip')
         return (weights[:, None] @ around)[:, 0]
 
     def _places(self, offset: Complex, radius: Array) -> Array:
         """Places in the grid by angle and azimuth (2, N) of floor points; see :meth:`_read`."""
         at = np.empty((2, len(offset)))
-        np.multiply(np.arctan(radius / self.height), _ANGLES / self._last_angle, out=at[0])
-        np.multiply(
-            np.arctan2(offset.imag, offset.real), _AZIMUTHS / (2.0 * np.pi), out=at[1])
+        np.arctan(radius / self.height, out=at[0])
+        np.arctan2(offset.imag, offset.real, out=at[1])
+        at *= self._knots_per_radian
         at += _BEGIN
         np.minimum(at[0], self._last_row, out=at[0])
         return at
@@ -310,10 +315,9 @@ class FloorTable:
 
     def sees_floor(self, pixels: Array) -> NDArray[np.bool_]:
         """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
-        at = np.rint(np.minimum(np.maximum(pixels, -1.0), self._beyond)) + 1.0
-        index = at[:, 0] + at[:, 1] * (self._beyond[0] + 2.0)
+        at = np.rint(np.minimum(np.maximum(pixels, -1.0), self._beyond)) @ self._apart
         # What is not a number becomes an index below all others, and is taken for the first.
-        return self._sees_floor.take(index.astype(np.intp), mode='clip')
+        return self._sees_floor.take((at + self._first).astype(np.intp), mode='clip')
 
     def floor(self, pixels: Array) -> tuple[Array, Array]:
         """Ground points (N, 2) of pixels in :attr:`region`, and d(point)/d(u, v) (N, 2, 2).

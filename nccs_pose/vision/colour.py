@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 import math
 
@@ -160,4 +160,5 @@ class LineColour:
             return self
         step = min(max(float(height @ left) / total, -_BLUR_STEP), _BLUR_STEP)
         least, most = _BLUR_RANGE
-        return replace(self, blur=min(max(self.blur + step, least), most))
+        return LineColour(
+            self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most))

@@ -129,9 +129,11 @@ def profile_products(
     products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([1.0, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    pooled = np.add.reduceat(products.reshape(n, 56), first, axis=0)
-    return (np.multiply(pooled.T.reshape(7, 8, -1), scale[:7, None, None] * scale[:, None],
-                        order='C'),
+    # Taken for complex numbers they are half as many to add.
+    pooled = np.add.reduceat(products.reshape(n, 56).view(np.complex64), first, axis=0)
+    return (np.multiply(
+        pooled.view(np.float32).T.reshape(7, 8, -1), scale[:7, None, None] * scale[:, None],
+        order='C'),
             products[:, 1] * (steepness * scale), floor)
 
 

@@ -101,7 +101,7 @@ class _Groups(NamedTuple):
         parts = np.minimum(np.maximum(count * bands.spacing[begin] // _SHARED_PX, 1.0), count)
         share = parts / count
         number = (np.arange(len(bands)) * share.repeat(count) + (
-            np.cumsum(parts) - parts - begin * share + 1e-9).repeat(count)).astype(np.intp)
+            parts.cumsum() - parts - begin * share + 1e-9).repeat(count)).astype(np.intp)
         return cls(*runs(number), number)
 
 
