@@ -30,7 +30,7 @@ from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, map_coordinates, spline_filter
+from scipy.ndimage import correlate1d, spline_filter
 
 # The angle from the nadir varies almost linearly with the image radius, so a coarse grid in
 # (angle, azimuth) with cubic splines is enough.
@@ -154,7 +154,11 @@ class FloorTable:
             whole, rig.cop, rig.T_base_mirror.inverse().apply(points.reshape(-1, 3)))
         pixels, in_front = rig.camera.project((m - rig.cop) @ rig.R_mirror_camera)
         seen = (visible & in_front).reshape(points.shape[:2])
-        self._mirror_points, falls = self._rays(points, m, seen)
+        mirror, falls = self._rays(points, m, seen)
+        # As many rows as the pixels have after their padding.
+        mirror = np.pad(mirror, ((0, _PADDING), (0, 0), (0, 0)), mode='edge')
+        self._mirror_points = np.stack(
+            [spline_filter(mirror[..., k]) for k in range(3)], axis=-1).reshape(-1, 3)
         # Outward, past the foot, and as good as the same all round.
         past = radius[_PADDING + 1:]
         outward = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)
@@ -214,7 +218,7 @@ class FloorTable:
 
     def _rays(
         self, points: Array, m: Array, seen: NDArray[np.bool_],
-    ) -> tuple[tuple[Array, ...], Array]:
+    ) -> tuple[Array, Array]:
         """Where rays leave the mirror, and how far over the floor they go as they fall by a metre.
 
         Where none is seen stands that of the angle before.
@@ -222,7 +226,7 @@ class FloorTable:
         :param points: on the floor (angles, azimuths, 3), in base_link.
         :param m: their mirror points, in the mirror frame (angles x azimuths, 3).
         :param seen: which are seen (angles, azimuths).
-        :returns: x, y and z (angles, azimuths) of the mirror points, in base_link; and the falls
+        :returns: the mirror points in base_link (angles, azimuths, 3); and the falls
             (angles, azimuths, 2).
         """
         mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
@@ -230,7 +234,7 @@ class FloorTable:
         for row in range(1, len(falls)):
             mirror[row, ~seen[row]] = mirror[row - 1, ~seen[row]]
             falls[row, ~seen[row]] = falls[row - 1, ~seen[row]]
-        return tuple(np.ascontiguousarray(mirror[..., k]) for k in range(3)), falls
+        return mirror, falls
 
     def falls(self, radius: Array) -> Array:
         """How far outward over the floor a ray goes as it falls by a metre, over the radius (N,).
@@ -246,13 +250,11 @@ class FloorTable:
         :param rise: how far they are over the floor, or under it (N,); small, metres.
         """
         offset = as_complex(points) - self._foot
-        at = self._places(offset, np.abs(offset))
-        x, y, z = (map_coordinates(component, at, order=1, mode='nearest')
-                   for component in self._mirror_points)
+        mirror = self._read(self._mirror_points, offset, np.abs(offset))
         # The ray meets the floor a little further on, but comes from the same place.
+        z = mirror[:, 2]
         share = rise / np.maximum(z - rise, 0.5 * z)
-        return np.stack([points[:, 0] + share * (points[:, 0] - x),
-                         points[:, 1] + share * (points[:, 1] - y)], axis=1)
+        return points + share[:, None] * (points - mirror[:, :2])
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""

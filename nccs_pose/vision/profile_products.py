@@ -54,11 +54,11 @@ def read_pixels(
     terms[:, 1] = half_band * across
     terms[:, 2] = -1j * bands.spacing * across
     terms[:, 3] = bend * np.square(bands.spacing) * across
-    at = terms @ _grid(rows, k)
-    pixels = at.view(np.float32)
+    pixels = terms.view(np.float32) @ _grid(rows, k)
     np.rint(pixels, out=pixels)
-    values = cv2.remap(image, pixels.reshape(*at.shape, 2), None, cv2.INTER_NEAREST,
+    values = cv2.remap(image, pixels.reshape(len(bands), -1, 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
+    at = pixels.view(np.complex64)
     at -= centre[:, None]
     at *= across.conj()[:, None]
     s = np.square(at.imag)
@@ -67,17 +67,20 @@ def read_pixels(
 
 
 @cache
-def _grid(rows: int, count: int) -> NDArray[np.complex64]:
-    """1, places across from -1 to 1, along from -1/2 to 1/2, and their squares (4, rows x count).
+def _grid(rows: int, count: int) -> NDArray[np.float32]:
+    """1, places across from -1 to 1, along from -1/2 to 1/2, and their squares.
+
+    Each for the real and for the imaginary part of a complex factor, in turns: quicker than a
+    product of complex matrices (8, rows x count x 2).
 
     :param rows: of places along, in the middles of equal parts.
     :param count: of places across.
     """
     along, across = np.meshgrid(
         (np.arange(rows) + 0.5) / rows - 0.5, np.linspace(-1.0, 1.0, count), indexing='ij')
-    return np.stack([
+    return np.kron(np.stack([
         np.ones(rows * count), across.ravel(), along.ravel(), np.square(along.ravel()),
-    ]).astype(np.complex64)
+    ]), np.eye(2)).astype(np.float32)
 
 
 def as_complex(points: Array) -> NDArray[np.complex64]:
