@@ -111,13 +111,18 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """One pass: what the stations say, which of them are used, and the pose that follows."""
+    """One pass: what the stations say, which of them are used, and the pose that follows.
+
+    :ivar moved: how far the solve moves the station that it moves farthest, px.
+    :ivar leant: the same by height, roll and pitch alone.
+    """
 
     refinement: Refinement
     bands: Bands
     fit: ProfileFit
     used: NDArray[np.intp]
     moved: float
+    leant: float
     colours: tuple[LineColour, ...]
 
 
@@ -160,14 +165,18 @@ class Aligner:
         if len(places) < _LEAST_STATIONS:
             return None
         attitude = np.zeros(3)
-        sharp = min(colour.blur for colour in colours) < ROUGH_BLUR
-        if (sharp or 0.0 < reach <= LINEAR_PX) and len(places) >= _ROUGH * _LEAST_STATIONS:
+        sharpest = min(colour.blur for colour in colours)
+        inexact = sharpest < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
+        if inexact and len(places) >= _ROUGH * _LEAST_STATIONS:
             rough = self._measure(
                 image, places.every(_ROUGH), pose, prior, colours, attitude, rough=True)
             if rough is None and reach > 0.0:
                 return None
             if rough is not None:
-                pose, attitude = rough.refinement.pose, rough.refinement.attitude
+                pose = rough.refinement.pose
+                # What profiles bear needs no bands of its own.
+                if rough.leant > _SETTLED_BLURS * sharpest:
+                    attitude = rough.refinement.attitude
         result: Alignment | None = None
         for _ in range(_ITERATIONS):
             measured = self._measure(
@@ -265,10 +274,11 @@ class Aligner:
             (fit.shift + slide[:, 3:] @ attitude).take(used), fit.sigma.take(used),
             slide.take(used, axis=0), fit.group.take(used), bands.label.take(used),
             bands.across.take(used, axis=0), start, prior)
-        moved = slide[:, :3] @ refinement.pose.minus(start) + slide[:, 3:] @ (
-            refinement.attitude - attitude)
+        leant = slide[:, 3:] @ (refinement.attitude - attitude)
+        moved = slide[:, :3] @ refinement.pose.minus(start) + leant
         return _Measured(
-            refinement, bands, fit, used, float(np.abs(moved).max()), colours)
+            refinement, bands, fit, used, float(np.abs(moved).max()), float(np.abs(leant).max()),
+            colours)
 
 
 def _alignment(measured: _Measured, lines: int) -> Alignment:

@@ -185,7 +185,7 @@ class BandPredictor:
         slide[:, 3] = sinking
         np.multiply(sinking, middle.imag, out=slide[:, 4])
         np.multiply(-sinking, middle.real, out=slide[:, 5])
-        if keep.all():
+        if np.count_nonzero(keep) == len(keep):
             return bands, slide
         return bands[keep], slide[keep]
 
