@@ -37,9 +37,10 @@ _CAUCHY = 2.385
 _GATE = 3.0
 _WITHIN_GATE = 0.9733
 _ITERATIONS = 8
-# The robust stage only has to find the inliers: a step below this, in squared deviations of the
-# pose, moves no group's residual by as much as a tenth of its own.
-_FOUND = 0.1
+# The robust stage only has to find the inliers. After a step below this, in squared deviations of
+# the pose, the next is about a fifth of it, and moves no group's residual by as much as a tenth of
+# its own.
+_FOUND = 1.0
 # Where the lines say nothing the pose is still somewhere within 100 m and 10 rad.
 _VAGUE = np.diag([1e-4, 1e-4, 1e-2])
 _ONE = np.eye(6)
