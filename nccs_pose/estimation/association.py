@@ -48,6 +48,8 @@ _SAMPLES = 12
 _LONGEST_SAMPLE = 60.0
 # Fewer samples than this on lines refine no pose.
 _LEAST_SAMPLES = 4
+# What keeps a direction that no sample fixes where it is.
+_DAMPING = 1e-6 * np.eye(3)
 # Tapes whose ends are this close look the same, metres.
 _SAME_TAPE = 0.05
 # Poses this close are the same, metres and rad.
@@ -59,9 +61,11 @@ _SAME_YAW = 0.15
 class FittedCandidate(Candidate):
     """A pose that explains strips.
 
+    :ivar claimed: fraction of the strips' pixels that lie on map lines.
     :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px.
     """
 
+    claimed: float
     misfit: float
 
 
@@ -91,11 +95,10 @@ class Associator:
             poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_CLOSE]]
         if len(poses.place) > _REFINED:
             poses = poses[_distinct(poses, scorer.score(poses, _COARSE), _REFINED)]
-        poses = scorer.refined(poses)
-        claimed, misfit = scorer.fit(poses)
+        poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
         return tuple(
-            FittedCandidate(poses.pose(k), float(score[k]), float(misfit[k]))
+            FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]), float(misfit[k]))
             for k in _distinct(poses, score, most))
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
@@ -216,16 +219,6 @@ class _Scorer:
         weight = self._weight[step // 2::step]
         return on @ (weight / weight.sum())
 
-    def fit(self, poses: _Poses) -> tuple[Array, Array]:
-        """Fraction of the strips' pixels on map lines (H,), and how far off these they are.
-
-        :returns: the fraction, and the root mean square distance (H,), px; 0 if none is on any.
-        """
-        on, _, across = self._on_lines(poses)
-        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
-        total = on @ self._weight
-        return total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
-
     def explained(self, poses: _Poses, step: int = 1) -> Array:
         """Fraction of the map lines in view that strips lie on (H,).
 
@@ -259,23 +252,35 @@ class _Scorer:
         """Harmonic mean of both fractions (H,)."""
         return _harmonic(self.claimed(poses, step), self.explained(poses, step))
 
-    def refined(self, poses: _Poses) -> _Poses:
-        """Lay the strips on their lines by least squares on the floor, from poses (H,)."""
+    def refined(self, poses: _Poses) -> tuple[_Poses, Array, Array]:
+        """Lay the strips on their lines by least squares on the floor, from poses (H,).
+
+        :returns: the poses, the fraction of the strips' pixels on map lines (H,), and the root
+            mean square distance of these (H,), px; 0 if none is on any. Of a last step that is
+            small enough both are as it says that they will be.
+        """
         inverse = 1.0 / self._tolerance
+        count = len(poses.place)
+        rows = np.empty((count, 4, len(inverse)))
         for _ in range(_ROUNDS):
             on, which, across = self._on_lines(poses)
             weight = on * inverse
-            normal = self._nearest.normal[which] * weight
+            normal = self._nearest.normal.take(which) * weight
             turned = poses.rotation[:, None] * self._points
-            # Derivatives of the distances by x, y and yaw.
-            jacobian = np.stack([normal.real, normal.imag, (normal * turned.conj()).imag], axis=1)
-            matrix = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
-            error = np.where(on, across, 0.0) * weight
-            step = np.linalg.solve(matrix, jacobian @ error[..., None])[..., 0]
+            # Derivatives of the distances by x, y and yaw, and the distances.
+            rows[:, 0], rows[:, 1] = normal.real, normal.imag
+            rows[:, 2] = (normal * turned.conj()).imag
+            np.multiply(across, weight, out=rows[:, 3])
+            products = rows @ rows.transpose(0, 2, 1)
+            step = np.linalg.solve(products[:, :3, :3] + _DAMPING, products[:, :3, 3:])[..., 0]
             step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
             poses = _Poses(poses.rotation * np.exp(-1j * step[:, 2]),
                            poses.place - step[:, 0] - 1j * step[:, 1])
-        return poses
+        across -= (step[:, None] @ rows[:, :3])[:, 0] * self._tolerance
+        on &= np.abs(across) < self._tolerance
+        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
+        total = on @ self._weight
+        return poses, total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
 
 
 def _harmonic(a: Array, b: Array) -> Array:

@@ -123,8 +123,7 @@ class Localiser:
         self._aligner = Aligner(self._table, self._map, options)
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
-        self._sifter = Sifter(
-            self._aligner, self._judge, self._searcher, self._symmetries, options)
+        self._sifter = Sifter(self._aligner, self._judge, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""

@@ -21,13 +21,12 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
-from nccs_pose.estimation.association import same_pose
+from nccs_pose.estimation.association import FittedCandidate, same_pose
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
@@ -43,6 +42,8 @@ _WORTH_TRYING = 0.6
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
+# Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
+_AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 
@@ -77,21 +78,35 @@ class _Start:
     """A pose to lay on an image.
 
     :ivar reach: how far it may be off in the image, px.
-    :ivar score: of the strips, 0 to 1; None if it has to be tried in any case.
-    :ivar misfit: how far the strips lie off its lines, px.
+    :ivar strips: what they say of it; None if it has to be tried in any case.
     """
 
     pose: Pose2
     reach: float
-    score: float | None = None
-    misfit: float = 0.0
+    strips: FittedCandidate | None = None
+
+    @classmethod
+    def of(cls, candidate: FittedCandidate) -> _Start:
+        """From what the strips say."""
+        return cls(candidate.pose, _SEARCH_BAND, candidate)
+
+    @property
+    def misfit(self) -> float:
+        """How far the strips lie off its lines, px."""
+        return 0.0 if self.strips is None else self.strips.misfit
+
+    def kept(self, pose: Pose2) -> FittedCandidate | None:
+        """What the strips say of the pose that it became on the image; None where that is new."""
+        moved = np.abs(pose.minus(self.pose))
+        near = max(moved[0], moved[1]) < _AS_LAID[0] and moved[2] < _AS_LAID[1]
+        return self.strips if near else None
 
 
 class Sifter:
     """Lays poses on images of one rig and map."""
 
     def __init__(
-        self, aligner: Aligner, judge: Judge, searcher: Searcher, symmetries: tuple[Pose2, ...],
+        self, aligner: Aligner, judge: Judge, symmetries: tuple[Pose2, ...],
         options: LocaliserOptions,
     ) -> None:
         """Prepare.
@@ -100,7 +115,6 @@ class Sifter:
         """
         self._aligner = aligner
         self._judge = judge
-        self._searcher = searcher
         self._symmetries = symmetries
         self._options = options
 
@@ -116,10 +130,9 @@ class Sifter:
         """
         options = self._options
         starts = [_Start(h.pose, options.band) for h in hypotheses]
-        starts += [
-            _Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[:_TRIED]
-            if c.score >= _WORTH_TRYING * sight.promise]
-        left = [_Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[_TRIED:]]
+        starts += [_Start.of(c) for c in sight.candidates[:_TRIED]
+                   if c.score >= _WORTH_TRYING * sight.promise]
+        left = [_Start.of(c) for c in sight.candidates[_TRIED:]]
         sifted = Sifted([], [], [], [])
         doubtful: list[Found] = []
         seen: list[Pose2] = []
@@ -138,8 +151,9 @@ class Sifter:
                 continue
             seen.append(alignment.pose)
             expected = is_expected(alignment, prediction, options.innovation_gate)
+            strips = start.kept(alignment.pose)
             found = self._judge.found(
-                sight.image, alignment, sight.segments, doubts, expected=expected)
+                sight.image, alignment, sight.segments, doubts, expected=expected, strips=strips)
             if isinstance(found, Found) and not expected and self._doubtful(found, sight):
                 doubtful.append(found)
                 sifted.refused.append(Refused(_DOUBTFUL, alignment))
@@ -147,8 +161,8 @@ class Sifter:
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found.hidden:
-                    score, _ = self._searcher.score(alignment.pose, sight.segments)
-                    sifted.hidden.append(Candidate(alignment.pose, score))
+                    shown = self._judge.measured(alignment, sight.segments, strips)
+                    sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
                 continue
             sifted.held.append(found)
             starts += [_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries]
@@ -183,7 +197,8 @@ class Sifter:
                 sifted.hidden.append(Candidate(pose, found.by_strips))
         seen = list(seen)
         for start in left:
-            share = 1.0 if start.score is None else min(start.score / best.by_strips, 1.0)
+            share = 1.0 if start.strips is None else min(
+                start.strips.score / best.by_strips, 1.0)
             if share >= ratio and not any(same_pose(start.pose, pose) for pose in seen):
                 seen.append(start.pose)
                 sifted.open.append(Candidate(start.pose, share * best.score))
@@ -219,10 +234,10 @@ class Sifter:
         what is left of that by how far they lie off its lines; and where the strips show all that
         the pose that holds expects, and nothing else, they tell rivals as well as the image.
         """
-        if start.score is None:
+        if start.strips is None:
             return True
-        ratio = self._options.ambiguity_ratio
-        if explains_nearly_all(held) and start.score < ratio * held.by_strips:
+        ratio, score = self._options.ambiguity_ratio, start.strips.score
+        if explains_nearly_all(held) and score < ratio * held.by_strips:
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
-        return math.sqrt(start.score) * fit_of(excess) >= ratio * held.score
+        return math.sqrt(score) * fit_of(excess) >= ratio * held.score
