@@ -24,6 +24,7 @@ from nccs_pose.estimation.association import (
     map_symmetries,
     same_pose,
 )
+from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines
@@ -359,8 +360,10 @@ def _segments(
     if hide is not None:
         image[:, hide] = 205
     mask = chromatic_mask(image, 'green', 4.5, 0.05, 31)
+    v, u = np.indices(mask.shape).reshape(2, -1)
     return floor_segments(
-        find_blobs(mask & table.region, 400), table, WIDTH, 'green',
+        find_blobs(mask & table.region, 400),
+        PixelFloor(np.column_stack([u, v]), 1, table), WIDTH, 'green',
         longest=max(line.length for line in line_map))
 
 

@@ -28,9 +28,9 @@ from nccs_pose.estimation.floor_points import (
     FloorLine,
     FloorPoints,
     misplaced,
+    PixelFloor,
     principal_lines,
 )
-from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.segment import Segmentation, upper_median
 import numpy as np
@@ -95,11 +95,12 @@ class FloorSegment:
 
 
 def floor_segments(
-    segmentation: Segmentation, table: FloorTable, width: float, colour: str, most: int = 16,
+    segmentation: Segmentation, floor: PixelFloor, width: float, colour: str, most: int = 16,
     longest: float = math.inf,
 ) -> tuple[FloorSegment, ...]:
     """Straight strips among the blobs, those of most pixels first.
 
+    :param floor: behind the pixels of the blobs' mask.
     :param width: width of the tapes, metres.
     :param longest: length of the longest of them, metres.
     :param colour: their colour class.
@@ -107,7 +108,7 @@ def floor_segments(
     """
     if len(segmentation.pixels) == 0:
         return ()
-    points = FloorPoints.of(segmentation, table, width)
+    points = floor.points(segmentation, width)
     normals, offsets, kept = _candidates(points, width)
     if len(normals) == 0:
         return ()

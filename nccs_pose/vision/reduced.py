@@ -64,6 +64,13 @@ class ReducedView:
             cv2.bitwise_and(mask, self.region), pixels_per_blob, pitch=self.pitch)
         return replace(found, pixels=found.pixels + self._origin)
 
+    @property
+    def pixels(self) -> Array:
+        """The middles of the view's pixels, row by row (h * w, 2), in the image."""
+        row, column = np.indices(self.region.shape).reshape(2, -1)
+        return self.pitch * np.column_stack([column, row]) + (
+            self._origin + 0.5 * (self.pitch - 1))
+
     def places(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns (N,) of the view that hold pixels (N, 2) of the image, or are next."""
         last = np.array(self.region.shape[::-1]) - 1

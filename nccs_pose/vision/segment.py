@@ -52,6 +52,7 @@ class Segmentation:
 
     :ivar mask: (H, W) uint8, 255 where it has.
     :ivar pixels: pixels (P, 2) of the blobs, u and v, at most a fixed number of each blob.
+    :ivar place: of each in the mask, row by row (P,).
     :ivar label: blob of each (P,).
     :ivar weight: how many pixels of its blob each stands for (P,).
     :ivar pitch: side of what was one pixel when the blobs were found, px.
@@ -59,6 +60,7 @@ class Segmentation:
 
     mask: Mask
     pixels: Array
+    place: NDArray[np.intp]
     label: NDArray[np.intp]
     weight: Array
     pitch: int = 1
@@ -174,7 +176,8 @@ def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentat
     stride = np.maximum(1, size // pixels_per_blob)
     first = np.cumsum(size) - size
     chosen = np.flatnonzero((np.arange(len(blob)) - first[blob]) % stride[blob] == 0)
-    row, column = np.divmod(place[order[chosen]], mask.shape[1])
+    place, label = place[order[chosen]], blob[chosen]
+    row, column = np.divmod(place, mask.shape[1])
     return Segmentation(
-        closed, pitch * np.column_stack([column, row]) + 0.5 * (pitch - 1), blob[chosen],
-        stride[blob[chosen]] * float(pitch * pitch), pitch)
+        closed, pitch * np.column_stack([column, row]) + 0.5 * (pitch - 1), place, label,
+        stride[label] * float(pitch * pitch), pitch)
