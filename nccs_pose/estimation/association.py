@@ -32,6 +32,7 @@ from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.small_matrices import definite_solutions
 import numpy as np
 from numpy.typing import NDArray
 
@@ -272,7 +273,7 @@ class _Scorer:
             rows[:, 2] = (normal * turned.conj()).imag
             np.multiply(across, weight, out=rows[:, 3])
             products = rows @ rows.transpose(0, 2, 1)
-            step = np.linalg.solve(products[:, :3, :3] + _DAMPING, products[:, :3, 3:])[..., 0]
+            step = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
             step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
             poses = _Poses(poses.rotation * np.exp(-1j * step[:, 2]),
                            poses.place - step[:, 0] - 1j * step[:, 1])

@@ -218,7 +218,7 @@ def _strip(
         of its blobs that lie just beside it; None where too little is left.
     """
     for _ in range(2):
-        line = FloorLine.through(points.moments[inside].sum(axis=0))
+        line = FloorLine.through(points.moments.take(inside, axis=0).sum(axis=0))
         along, beyond = line.places(points, width)
         before = inside
         inside = np.flatnonzero((beyond < 0.0) & free)
@@ -226,7 +226,7 @@ def _strip(
             inside = _longest_run(points, along, inside, _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
-        if np.array_equal(inside, before):
+        if len(inside) == len(before) and bool((inside == before).all()):
             break
     low, high = along[inside].min(), along[inside].max()
     if high - low < _LEAST_LENGTH:

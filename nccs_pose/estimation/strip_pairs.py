@@ -106,8 +106,8 @@ def poses_of_pairs(
         return np.zeros(0, complex), np.zeros(0, complex)
     found, count = [], 0
     # Whole pairs of strips: any of them may be the one that is not what it seems.
-    starts = np.flatnonzero(np.diff(pair, prepend=-1))
-    cuts = starts[1:] if len(pair) > _ENOUGH else starts[:0]
+    ends = np.flatnonzero(pair[1:] > pair[:-1]) + 1
+    cuts = ends if len(pair) > _ENOUGH else ends[:0]
     for part in np.split(np.arange(len(pair)), cuts):
         one, other = first[pair[part]], second[pair[part]]
         found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))
@@ -129,17 +129,16 @@ def _laid(
     # Strips and lines go either way: half a turn between both does not count.
     rotation = by_first + np.copysign(1.0, (by_second * by_first.conj()).real) * by_second
     rotation /= np.abs(rotation)
-    # Either way round.
-    rotation = np.concatenate([rotation, -rotation])
-    strip, direction, line = np.tile(strip, 2), np.tile(direction, 2), np.tile(line, 2)
-    # Each middle in its line's own frame, along + i across, but for the place.
+    # Either way round (2, 1, K).
+    rotation = np.array([rotation, -rotation])[:, None]
+    # Each middle in its line's own frame, along + i across, but for the place (2, 2, K).
     middle = (rotation * strips.middle[strip] - lines.start[line]) * direction.conj()
     off = middle.imag / (direction[1] * direction[0].conj()).imag
-    place = off[1] * direction[0] - off[0] * direction[1]
+    place = off[:, 1:] * direction[0] - off[:, :1] * direction[1]
     along = middle.real + (place * direction.conj()).real
     half = 0.5 * strips.length[strip]
     outside = (np.maximum(half - along, 0.0)
                + np.maximum(along + half - lines.length[line], 0.0))
     # Something in line with a tape may have been joined to it.
-    good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=0)
-    return rotation[good], place[good]
+    good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=1)
+    return rotation[:, 0][good], place[:, 0][good]

@@ -149,7 +149,9 @@ def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
     return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), low, high)
 
 
-def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentation:
+def find_blobs(
+    mask: Mask, pixels_per_blob: int, *, pitch: int = 1, origin: tuple[int, int] = (0, 0),
+) -> Segmentation:
     """Close small gaps and collect what lies within the contours of a mask.
 
     Tapes may be a pixel wide, so nothing is ever eroded.
@@ -157,6 +159,7 @@ def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentat
     :param mask: (H, W) uint8, 255 inside.
     :param pitch: the mask is of an image so many times smaller; pixels and weights are given in
         those of the image itself.
+    :param origin: column and row of the image where the mask begins.
     """
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -178,6 +181,9 @@ def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentat
     chosen = np.flatnonzero((np.arange(len(blob)) - first[blob]) % stride[blob] == 0)
     place, label = place[order[chosen]], blob[chosen]
     row, column = np.divmod(place, mask.shape[1])
+    middle, pixels = 0.5 * (pitch - 1), np.empty((len(place), 2))
+    pixels[:, 0] = pitch * column + (origin[0] + middle)
+    pixels[:, 1] = pitch * row + (origin[1] + middle)
     return Segmentation(
-        closed, pitch * np.column_stack([column, row]) + 0.5 * (pitch - 1), place, label,
+        closed, pixels, place, label,
         stride[label] * float(pitch * pitch), pitch)
