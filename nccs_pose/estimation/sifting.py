@@ -204,11 +204,11 @@ class Sifter:
                 sifted.open.append(Candidate(start.pose, share * best.score))
 
     def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
-        """Lay a pose on the image: by searching its surroundings only where a line is left out."""
+        """Lay a pose on the image: by searching its surroundings only where it does not fit."""
         if start.misfit < LINEAR_PX:
             alignment = self._aligner.align(
                 sight.image, start.pose, sight.colours, reach=LINEAR_PX)
-            if alignment is not None and not alignment.missing:
+            if alignment is not None:
                 return alignment
         return self._aligner.align(
             sight.image, start.pose, sight.colours, reach=start.reach)

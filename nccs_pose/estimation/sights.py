@@ -30,6 +30,11 @@ from numpy.typing import NDArray
 # the next scores less than this part of it.
 _PLAIN = 0.8
 _RIVAL = 0.8
+# A place is one of many when more poses than this score so and leave next to nothing unexplained
+# of so many strips.
+_MANY = 6
+_ALL = 0.95
+_LEAST_STRIPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +64,21 @@ class Sight:
         return self.promise > _PLAIN or (
             self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise)
 
+    @property
+    def is_repeated(self) -> bool:
+        """Whether many places show all that is seen here: more of it would tell none of them."""
+        equal = [c for c in self.candidates
+                 if c.claimed > _ALL and c.score > _RIVAL * self.promise]
+        return len(equal) > _MANY and len(self.segments) >= _LEAST_STRIPS
+
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
     lap: Callable[[str], None],
 ) -> Iterator[Sight]:
-    """What is worth a try: every look that is promising, and at last the best if none was.
+    """What is worth a try: every look that is promising or, if none is, the best.
+
+    So is one at which many places look the same.
 
     What is given is to be tried before the next is asked for.
 
@@ -89,7 +103,7 @@ def sights(
         elif shown is not colours:
             # What tapes look like was learned, if not more of them found.
             sight = best = replace(best, colours=shown)
-        if sight.is_promising:
+        if sight.is_promising or sight.is_repeated:
             tried.append(sight)
             yield sight
         if len(tried) > 1 and best.promise > _PLAIN:
