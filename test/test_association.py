@@ -231,6 +231,35 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
         assert part < claimed
 
 
+def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
+    crosses = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
+    line_map = LineMap(tuple(
+        line for x, y in crosses
+        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+    pose = Pose2(12.3, 6.4, 0.7)
+    strips = _strips(line_map, pose, np.random.default_rng(25))
+    candidates = Associator(line_map, table).candidates(strips)
+    assert all(a.score >= b.score for a, b in itertools.pairwise(candidates))
+    # Wherever all that is in view is there as well.
+    inner = [Pose2(pose.x + 3.0 * i, pose.y + 3.0 * j, pose.yaw)
+             for i in range(-3, 4) for j in range(-1, 2)]
+    for place in inner:
+        told = [c for c in candidates if _near(c.pose, place, 0.25, 0.1)]
+        assert len(told) == 1 and told[0].score > 0.8 * candidates[0].score
+    assert len(candidates) <= 300
+
+
+def test_one_strip_across_many_heavier_ones_is_enough(table: FloorTable) -> None:
+    spacing = np.cumsum([0.0, 0.3, 0.35, 0.25, 0.4, 0.3, 0.45, 0.3, 0.5])
+    line_map = LineMap((
+        *(_line((-1.5, -1.2 + y), (1.5, -1.2 + y)) for y in spacing.tolist()),
+        _line((1.7, -0.4), (1.75, 0.1))))
+    pose = Pose2(0.1, -0.2, 0.4)
+    strips = _strips(line_map, pose, np.random.default_rng(26))
+    assert not _cross(strips[:6]) and _cross(strips)
+    assert _near(Associator(line_map, table).candidates(strips)[0].pose, pose)
+
+
 def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -> None:
     line_map = LineMap((
         _line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5)),

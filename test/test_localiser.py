@@ -231,6 +231,25 @@ def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
     assert states.count(State.AMBIGUOUS) >= 8
 
 
+def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
+    grid = LineMap((
+        *(_line((-8.0, y), (8.0, y), f'along {y}') for y in np.arange(-8.0, 8.5, 2.0)),
+        *(_line((x, -8.0), (x, 8.0), f'across {x}') for x in np.arange(-8.0, 8.5, 2.0))))
+    scene = replace(ideal_scene(640, 0.02), line_map=grid)
+    pose = Pose2(0.3, -0.4, 0.3)
+    estimate = Localiser(scene.rig, grid).process(0, render(scene, pose, np.random.default_rng(0)))
+    assert estimate.state is State.AMBIGUOUS and estimate.pose is None
+    scores = [candidate.score for candidate in estimate.candidates]
+    assert scores == sorted(scores, reverse=True)
+    # The robot, and where it is by each quarter of a turn, wherever what it sees may be.
+    for turn in np.arange(4) * np.pi / 2.0:
+        for x, y in itertools.product((-2.0, 0.0, 2.0), repeat=2):
+            place = Pose2(x, y, float(turn)) @ pose
+            # What is not laid on the image is told as it was guessed.
+            assert any(math.hypot(c.pose.x - place.x, c.pose.y - place.y) < 0.2 and abs(
+                float(wrap_angle(c.pose.yaw - place.yaw))) < 0.1 for c in estimate.candidates)
+
+
 # ---------------------------------------------------------------- kidnapping
 
 

@@ -36,10 +36,10 @@ from nccs_pose.geometry.small_matrices import definite_solutions
 import numpy as np
 from numpy.typing import NDArray
 
-# Strips that start hypotheses; of these so many are looked at closely, by every third sample of
-# the strips, and so many are refined.
-_SEEDS = 6
-_CLOSE = 200
+# Pairs of strips that start hypotheses; of these so many are looked at closely, by every third
+# sample of the strips, and so many are refined. No more than these are told.
+_PAIRS = 15
+_CLOSE = 300
 _COARSE = 3
 _REFINED = 24
 _ROUNDS = 2
@@ -63,11 +63,12 @@ class FittedCandidate(Candidate):
     """A pose that explains strips.
 
     :ivar claimed: fraction of the strips' pixels that lie on map lines.
-    :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px.
+    :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px;
+        0 where it is not known.
     """
 
     claimed: float
-    misfit: float
+    misfit: float = 0.0
 
 
 class Associator:
@@ -82,25 +83,36 @@ class Associator:
         self._place = _Place(lines, NearestLines(lines), FloorScale(table))
         self._last: _Scorer | None = None
 
-    def candidates(
-        self, segments: tuple[FloorSegment, ...], most: int = 8,
-    ) -> tuple[FittedCandidate, ...]:
-        """Poses that explain strips, best first; none where fewer than two strips cross."""
+    def candidates(self, segments: tuple[FloorSegment, ...]) -> tuple[FittedCandidate, ...]:
+        """Poses that explain strips, best first; none where fewer than two strips cross.
+
+        The best few are laid on the strips by least squares; where a map has many places alike
+        the others follow as they were guessed, with what they score there.
+        """
         if len(segments) < 2:
             return ()
         scorer = self._scorer(segments)
-        poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _SEEDS))
+        poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _PAIRS))
         if len(poses.place) == 0:
             return ()
-        if len(poses.place) > _CLOSE:
-            poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_CLOSE]]
+        guessed: list[FittedCandidate] = []
         if len(poses.place) > _REFINED:
-            poses = poses[_distinct(poses, scorer.score(poses, _COARSE), _REFINED)]
+            claimed = scorer.claimed(poses, _COARSE)
+            best = np.argsort(-claimed, kind='stable')
+            if len(best) > _CLOSE:
+                best = _one_of_each(poses, best)[:_CLOSE]
+            poses, claimed = poses[best], claimed[best]
+            score = _harmonic(claimed, scorer.explained(poses, _COARSE))
+            found = _distinct(poses, score)
+            guessed = [FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]))
+                       for k in found[_REFINED:]]
+            poses = poses[found[:_REFINED]]
         poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
-        return tuple(
+        refined = [
             FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]), float(misfit[k]))
-            for k in _distinct(poses, score, most))
+            for k in _distinct(poses, score)]
+        return tuple(sorted((*refined, *guessed), key=lambda c: -c.score))
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
         """The score that a pose would have among the candidates, and the strips' part in it.
@@ -198,9 +210,10 @@ class _Scorer:
         self._layer = np.repeat(place.nearest.layers(strips.colour), _SAMPLES)
         # Where a point x, y, 1 is along each strip and across it, within 1 if it lies in it.
         frames = np.stack([strips.direction / (0.5 * strips.length + BEYOND),
-                           1j * strips.direction / tolerance], axis=1).ravel()
-        middle = np.repeat(strips.middle, 2)
-        self._frames = np.stack([frames.real, frames.imag, -(frames * middle.conj()).real])
+                           1j * strips.direction / tolerance])
+        self._frames = np.stack([
+            frames.real, frames.imag, -(frames * strips.middle.conj()).real],
+            axis=2).reshape(-1, 3).astype(np.float32)
 
     def _on_lines(
         self, poses: _Poses, step: int = 1,
@@ -241,17 +254,15 @@ class _Scorer:
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
         weight = np.minimum(
             self._scale.pixels(points, (length / _SAMPLES * along)[:, None]), _LONGEST_SAMPLE)
-        x, y = points.real.ravel(), points.imag.ravel()
-        on = np.abs(np.stack([x, y, np.ones(len(x))], axis=1) @ self._frames) < 1.0
-        on = on[:, ::2] & on[:, 1::2]
-        covered = np.where(on.any(axis=1).reshape(weight.shape), weight, 0.0)
+        at = np.ones((3, *points.shape), np.float32)
+        at[0], at[1] = points.real, points.imag
+        off = self._frames @ at.reshape(3, -1)
+        inside = np.abs(off, out=off) < 1.0
+        on = (inside[:len(inside) // 2] & inside[len(inside) // 2:]).any(axis=0)
+        covered = weight * on.reshape(weight.shape)
         count = len(poses.place)
         total = np.bincount(pose, weight.sum(axis=1), count)
         return np.bincount(pose, covered.sum(axis=1), count) / np.maximum(total, 1e-9)
-
-    def score(self, poses: _Poses, step: int = 1) -> Array:
-        """Harmonic mean of both fractions (H,)."""
-        return _harmonic(self.claimed(poses, step), self.explained(poses, step))
 
     def refined(self, poses: _Poses) -> tuple[_Poses, Array, Array]:
         """Lay the strips on their lines by least squares on the floor, from poses (H,).
@@ -288,7 +299,17 @@ def _harmonic(a: Array, b: Array) -> Array:
     return 2.0 * a * b / np.maximum(a + b, 1e-9)
 
 
-def _distinct(poses: _Poses, score: Array, most: int) -> list[int]:
+def _one_of_each(poses: _Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Of poses in an order (H,) the first in each cell of places and headings."""
+    cells = np.rint(np.stack([
+        poses.place.real / _SAME_PLACE, poses.place.imag / _SAME_PLACE,
+        np.angle(poses.rotation) / _SAME_YAW])[:, order]).astype(np.int64)
+    # Cells in a row: a map has far fewer than this a side.
+    _, first = np.unique(cells[0] + (cells[1] << 20) + (cells[2] << 40), return_index=True)
+    return order[np.sort(first)]
+
+
+def _distinct(poses: _Poses, score: Array) -> list[int]:
     """The best of each group of poses that are the same, best first."""
     order = np.argsort(-score, kind='stable')
     place, rotation = poses.place[order], poses.rotation[order]
@@ -296,7 +317,7 @@ def _distinct(poses: _Poses, score: Array, most: int) -> list[int]:
     same &= (rotation * rotation[:, None].conj()).real > math.cos(_SAME_YAW)
     found: list[int] = []
     left = np.ones(len(order), dtype=bool)
-    while len(found) < most and left.any():
+    while left.any():
         first = int(left.argmax())
         found.append(int(order[first]))
         left &= ~same[first]

@@ -195,13 +195,16 @@ class Sifter:
                 sifted.open.append(Candidate(pose, min(found.score, best.score)))
             else:
                 sifted.hidden.append(Candidate(pose, found.by_strips))
+        # Candidates differ among themselves; the twins of what holds need not differ from them.
         seen = list(seen)
-        for start in left:
+        for start in sorted(left, key=lambda start: start.strips is not None):
             share = 1.0 if start.strips is None else min(
                 start.strips.score / best.by_strips, 1.0)
             if share >= ratio and not any(same_pose(start.pose, pose) for pose in seen):
-                seen.append(start.pose)
+                if start.strips is None:
+                    seen.append(start.pose)
                 sifted.open.append(Candidate(start.pose, share * best.score))
+        sifted.open.sort(key=lambda candidate: -candidate.score)
 
     def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
         """Lay a pose on the image: by searching its surroundings only where it does not fit."""

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import combinations
 import math
 
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -28,6 +27,8 @@ from numpy.typing import NDArray
 
 # A map of many equal places gives no end of hypotheses: those of the heaviest strips are enough.
 _ENOUGH = 1500
+# A strip with each of those that are heavier, and then the next; no image has more of them.
+_BY_WEIGHT = np.tril_indices(128, -1)
 # Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
 _CROSSING = 0.12
 _ANGLE_GATE = 0.07
@@ -91,28 +92,30 @@ def poses_of_pairs(
     """Poses that lay a pair of strips on a pair of map lines, those of the heaviest strips first.
 
     :param strips: the heaviest first.
-    :param most: only so many of them are laid.
+    :param most: only so many pairs that cross are laid.
     :returns: the poses' rotations, unit (H,), and places (H,).
     """
     a, b, turn = lines.crossings
-    first, second = np.array(list(combinations(range(min(most, len(strips.length))), 2))).T
+    count = len(strips.length)
+    second, first = (side[:count * (count - 1) // 2] for side in _BY_WEIGHT)
     between = strips.direction[second] * strips.direction[first].conj()
+    cross = np.flatnonzero(np.abs(between.imag) >= math.sin(_CROSSING))[:most]
+    first, second, between = first[cross], second[cross], between[cross]
     match = np.abs((turn * between.conj()[:, None]).imag) < math.sin(_ANGLE_GATE)
-    match &= (np.abs(between.imag) >= math.sin(_CROSSING))[:, None]
     fits = strips.fits(lines)
     match &= fits[first][:, a] & fits[second][:, b]
     pair, crossing = np.nonzero(match)
     if len(pair) == 0:
         return np.zeros(0, complex), np.zeros(0, complex)
-    found, count = [], 0
+    found, laid = [], 0
     # Whole pairs of strips: any of them may be the one that is not what it seems.
     ends = np.flatnonzero(pair[1:] > pair[:-1]) + 1
     cuts = ends if len(pair) > _ENOUGH else ends[:0]
     for part in np.split(np.arange(len(pair)), cuts):
         one, other = first[pair[part]], second[pair[part]]
         found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))
-        count += len(found[-1][0])
-        if count > _ENOUGH:
+        laid += len(found[-1][0])
+        if laid > _ENOUGH:
             break
     rotations, places = (np.concatenate(parts) for parts in zip(*found))
     return rotations, places
