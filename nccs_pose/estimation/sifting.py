@@ -146,22 +146,17 @@ class Sifter:
             if not told and len(self._equals(sifted.held)) > 1:
                 left.append(start)
                 continue
-            alignment = self._laid(sight, start)
-            if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
+            verdict = self._verdict(sight, start, doubts, prediction, seen)
+            if verdict is None:
                 continue
+            alignment, found = verdict
             seen.append(alignment.pose)
-            expected = is_expected(alignment, prediction, options.innovation_gate)
-            strips = start.kept(alignment.pose)
-            found = self._judge.found(
-                sight.image, alignment, sight.segments, doubts, expected=expected, strips=strips)
-            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
-                doubtful.append(found)
-                sifted.refused.append(Refused(_DOUBTFUL, alignment))
-                continue
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
-                if found.hidden:
-                    shown = self._judge.measured(alignment, sight.segments, strips)
+                if found is _DOUBTFUL:
+                    doubtful.append(self._measured(sight, start, alignment))
+                elif found.hidden:
+                    shown = self._measured(sight, start, alignment)
                     sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
                 continue
             sifted.held.append(found)
@@ -206,15 +201,39 @@ class Sifter:
                 sifted.open.append(Candidate(start.pose, share * best.score))
         sifted.open.sort(key=lambda candidate: -candidate.score)
 
-    def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
-        """Lay a pose on the image: by searching its surroundings only where it does not fit."""
-        if start.misfit < LINEAR_PX:
+    def _verdict(
+        self, sight: Sight, start: _Start, doubts: Set[int], prediction: Prediction | None,
+        seen: list[Pose2],
+    ) -> tuple[Alignment, Found | Objection] | None:
+        """Lay a pose on the image, and judge it; None where it does not lie, or was seen before.
+
+        Its surroundings are searched only where it does not fit, or where a line that it misses
+        may be there.
+        """
+        verdict = None
+        for reach in (LINEAR_PX, start.reach):
+            if reach == LINEAR_PX and start.misfit >= LINEAR_PX:
+                continue
             alignment = self._aligner.align(
-                sight.image, start.pose, sight.colours, reach=LINEAR_PX)
-            if alignment is not None:
-                return alignment
-        return self._aligner.align(
-            sight.image, start.pose, sight.colours, reach=start.reach)
+                sight.image, start.pose, sight.colours, reach=reach)
+            if alignment is None:
+                continue
+            if any(same_pose(alignment.pose, pose) for pose in seen):
+                return verdict
+            expected = is_expected(alignment, prediction, self._options.innovation_gate)
+            found = self._judge.found(
+                sight.image, alignment, sight.segments, doubts, expected=expected,
+                strips=start.kept(alignment.pose))
+            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
+                found = _DOUBTFUL
+            verdict = alignment, found
+            if isinstance(found, Found) or not alignment.missing:
+                break
+        return verdict
+
+    def _measured(self, sight: Sight, start: _Start, alignment: Alignment) -> Found:
+        """How much a pose explains that was refused."""
+        return self._judge.measured(alignment, sight.segments, start.kept(alignment.pose))
 
     def _doubtful(self, found: Found, sight: Sight) -> bool:
         """Whether the strips speak as much for another pose, and the image for neither.
