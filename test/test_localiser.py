@@ -48,6 +48,9 @@ def _closed(*corners: tuple[float, float]) -> tuple[Line, ...]:
 
 RECTANGLE = LineMap(_closed((-2.0, -1.4), (2.0, -1.4), (2.0, 1.4), (-2.0, 1.4)))
 SQUARE = LineMap(_closed((-1.3, -1.3), (1.3, -1.3), (1.3, 1.3), (-1.3, 1.3)))
+GRID = LineMap((
+    *(_line((-8.0, y), (8.0, y), f'along {y}') for y in np.arange(-8.0, 8.5, 2.0)),
+    *(_line((x, -8.0), (x, 8.0), f'across {x}') for x in np.arange(-8.0, 8.5, 2.0))))
 
 
 class Drive:
@@ -232,12 +235,9 @@ def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
 
 
 def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
-    grid = LineMap((
-        *(_line((-8.0, y), (8.0, y), f'along {y}') for y in np.arange(-8.0, 8.5, 2.0)),
-        *(_line((x, -8.0), (x, 8.0), f'across {x}') for x in np.arange(-8.0, 8.5, 2.0))))
-    scene = replace(ideal_scene(640, 0.02), line_map=grid)
+    scene = replace(SCENE, line_map=GRID)
     pose = Pose2(0.3, -0.4, 0.3)
-    estimate = Localiser(scene.rig, grid).process(0, render(scene, pose, np.random.default_rng(0)))
+    estimate = Localiser(scene.rig, GRID).process(0, render(scene, pose, np.random.default_rng(0)))
     assert estimate.state is State.AMBIGUOUS and estimate.pose is None
     scores = [candidate.score for candidate in estimate.candidates]
     assert scores == sorted(scores, reverse=True)
@@ -248,6 +248,19 @@ def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
             # What is not laid on the image is told as it was guessed.
             assert any(math.hypot(c.pose.x - place.x, c.pose.y - place.y) < 0.2 and abs(
                 float(wrap_angle(c.pose.yaw - place.yaw))) < 0.1 for c in estimate.candidates)
+
+
+@pytest.mark.parametrize(('sigma', 'state'), [(0.15, State.TRACKING), (0.6, State.AMBIGUOUS)])
+def test_a_pose_that_is_given_decides_between_many_places(sigma: float, state: State) -> None:
+    """If it is good enough to tell a place from the next one, two metres away."""
+    scene = replace(SCENE, line_map=GRID)
+    pose = Pose2(-1.7, 1.6, 0.3)
+    localiser = Localiser(scene.rig, GRID)
+    localiser.set_prior(pose @ Pose2(0.2, -0.1, 0.05), np.diag([sigma, sigma, 0.1])**2)
+    estimate = localiser.process(0, render(scene, pose, np.random.default_rng(0)))
+    assert estimate.state is state
+    if state is State.TRACKING:
+        assert estimate.pose is not None and _near(estimate.pose, pose)
 
 
 # ---------------------------------------------------------------- kidnapping

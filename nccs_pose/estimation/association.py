@@ -28,6 +28,7 @@ from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs, StripLines
+from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -83,11 +84,16 @@ class Associator:
         self._place = _Place(lines, NearestLines(lines), FloorScale(table))
         self._last: _Scorer | None = None
 
-    def candidates(self, segments: tuple[FloorSegment, ...]) -> tuple[FittedCandidate, ...]:
+    def candidates(
+        self, segments: tuple[FloorSegment, ...], told: Told | None = None,
+    ) -> tuple[FittedCandidate, ...]:
         """Poses that explain strips, best first; none where fewer than two strips cross.
 
         The best few are laid on the strips by least squares; where a map has many places alike
         the others follow as they were guessed, with what they score there.
+
+        :param told: where the robot is by something else; poses there are not left out for others
+            that explain as much.
         """
         if len(segments) < 2:
             return ()
@@ -98,12 +104,14 @@ class Associator:
         guessed: list[FittedCandidate] = []
         if len(poses.place) > _REFINED:
             claimed = scorer.claimed(poses, _COARSE)
-            best = np.argsort(-claimed, kind='stable')
+            there = np.zeros(len(claimed), dtype=bool) if told is None else (
+                told.holds_guesses(poses.place, poses.rotation))
+            best = np.lexsort([-claimed, ~there])
             if len(best) > _CLOSE:
                 best = _one_of_each(poses, best)[:_CLOSE]
-            poses, claimed = poses[best], claimed[best]
+            poses, claimed, there = poses[best], claimed[best], there[best]
             score = _harmonic(claimed, scorer.explained(poses, _COARSE))
-            found = _distinct(poses, score)
+            found = sorted(_distinct(poses, score), key=lambda k: not there[k])
             guessed = [FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]))
                        for k in found[_REFINED:]]
             poses = poses[found[:_REFINED]]

@@ -26,7 +26,7 @@ from dataclasses import replace
 import time
 
 from nccs_pose.estimation.admission import Admission
-from nccs_pose.estimation.alignment import Aligner, Alignment, close
+from nccs_pose.estimation.alignment import Aligner, Alignment
 from nccs_pose.estimation.association import map_symmetries, same_pose
 from nccs_pose.estimation.estimate import (
     Candidate,
@@ -58,6 +58,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sifting import Refused, Sifter
 from nccs_pose.estimation.sights import sights
+from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -252,13 +253,12 @@ class Localiser:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         now = self._odometry.at(stamp_ns)
         hypotheses = carried(self._open, self._open_odometry, now)
+        told = self._told(prediction)
         refusals: list[Refused] = []
         for sight in sights(
-                image, self._searcher, self._fresh_colours(), self._in_vain, watch.lap):
+                image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
             segments = sight.segments
-            sifted = self._sifter.sift(
-                sight, hypotheses, self._doubts, prediction, told=self._prior is not None
-                or prediction is not None or bool(hypotheses))
+            sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction, told)
             watch.lap('measure')
             refusals += sifted.refused
             if sifted.held:
@@ -278,7 +278,7 @@ class Localiser:
             if refused.objection is None and refusals:
                 refused = refusals[0]
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = self._decide(held, prediction)
+        chosen = self._decide(held, sifted.open, prediction, told)
         if chosen is not None:
             words = 'found by searching the whole image'
             if len(held) > 1:
@@ -313,16 +313,34 @@ class Localiser:
         _, claimed = self._searcher.score(followed.alignment.pose, segments)
         return (replace(followed, claimed=claimed), given) if claimed >= _CLAIMED else None
 
-    def _decide(self, held: list[Found], prediction: Prediction | None) -> Found | None:
-        """The one pose that a prior or the prediction expects, if it is one of the best."""
-        good = [f for f in held if f.score >= self.options.ambiguity_ratio * held[0].score]
+    def _told(self, prediction: Prediction | None) -> Told | None:
+        """Where a prior or the prediction says that the robot is."""
         if self._prior is not None:
-            pose, covariance = self._prior
-            near = [f for f in good if close(
-                f.alignment.pose, pose, covariance + f.alignment.covariance, _PRIOR_GATE)]
-        else:
-            near = [f for f in good if self._expected(f.alignment, prediction)]
-        return near[0] if len(near) == 1 else None
+            return Told(*self._prior, _PRIOR_GATE)
+        if prediction is not None:
+            return Told(prediction.pose, prediction.covariance, self.options.innovation_gate)
+        return None
+
+    def _decide(
+        self, held: list[Found], left: list[Candidate], prediction: Prediction | None,
+        told: Told | None,
+    ) -> Found | None:
+        """The one pose that a prior or the prediction expects, if it is one of the best of all.
+
+        :param left: poses that may explain the image as well, but were not laid on it.
+        """
+        if told is None:
+            return None
+        near = [f for f in held if (
+            told.holds(f.alignment.pose, f.alignment.covariance) if self._prior is not None
+            else self._expected(f.alignment, prediction))]
+        if not near or any(told.holds(c.pose) for c in left):
+            return None
+        best, ratio = near[0], self.options.ambiguity_ratio
+        if best.score < ratio * held[0].score or any(
+                f.score >= ratio * best.score for f in near[1:]):
+            return None
+        return best
 
     def _tracking(
         self, stamp_ns: int, found: Found, prior: Prediction | None, watch: _Stopwatch,

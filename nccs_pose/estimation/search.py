@@ -24,6 +24,7 @@ from nccs_pose.estimation.association import Associator, FittedCandidate
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
@@ -163,9 +164,11 @@ class Searcher:
                 blobs, self._floor, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:
-        """Poses that explain the strips, best first."""
-        return self._associator.candidates(segments)
+    def candidates(
+        self, segments: Strips, told: Told | None = None,
+    ) -> tuple[FittedCandidate, ...]:
+        """Poses that explain the strips, best first; of too many those where it is told."""
+        return self._associator.candidates(segments, told)
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

@@ -28,6 +28,7 @@ from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_ex
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.sights import Sight
+from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -120,19 +121,24 @@ class Sifter:
 
     def sift(
         self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
-        prediction: Prediction | None, *, told: bool,
+        prediction: Prediction | None, told: Told | None,
     ) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image.
 
         :param doubts: lines that were seen beside their place and not in it since.
-        :param told: whether something else than the image can decide between equal poses. If not,
-            two are enough to know that it does not.
+        :param told: where the robot is by something else than the image, which can decide between
+            equal poses: those that are there come first. Without it and without hypotheses two
+            equal poses are enough to know that the image does not decide.
         """
         options = self._options
+        open_end = told is None and not hypotheses
+        candidates = sight.candidates
+        if told is not None and len(candidates) > _TRIED:
+            candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
         starts = [_Start(h.pose, options.band) for h in hypotheses]
-        starts += [_Start.of(c) for c in sight.candidates[:_TRIED]
+        starts += [_Start.of(c) for c in candidates[:_TRIED]
                    if c.score >= _WORTH_TRYING * sight.promise]
-        left = [_Start.of(c) for c in sight.candidates[_TRIED:]]
+        left = [_Start.of(c) for c in candidates[_TRIED:]]
         sifted = Sifted([], [], [], [])
         doubtful: list[Found] = []
         seen: list[Pose2] = []
@@ -143,7 +149,7 @@ class Sifter:
                 continue
             if any(same_pose(start.pose, pose) for pose in seen):
                 continue
-            if not told and len(self._equals(sifted.held)) > 1:
+            if open_end and len(self._equals(sifted.held)) > 1:
                 left.append(start)
                 continue
             verdict = self._verdict(sight, start, doubts, prediction, seen)
@@ -160,7 +166,9 @@ class Sifter:
                     sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
                 continue
             sifted.held.append(found)
-            starts += [_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries]
+            for twin in (_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries):
+                elsewhere = told is not None and not told.holds(twin.pose)
+                (left if elsewhere else starts).append(twin)
             if best is None or found.score > best[1].score:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.told import Told
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ class Sight:
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
-    lap: Callable[[str], None],
+    told: Told | None, lap: Callable[[str], None],
 ) -> Iterator[Sight]:
     """What is worth a try: every look that is promising or, if none is, the best.
 
@@ -84,6 +85,7 @@ def sights(
 
     :param in_vain: how many images before this one were searched and showed nothing; then the
         further looks take turns from image to image.
+    :param told: where the robot is by something else than the image.
     :param lap: is told the name of each stage that ends.
     """
     groups = searcher.further
@@ -96,7 +98,7 @@ def sights(
         if best is not None and segments is best.segments:
             continue
         lap('detect')
-        sight = Sight(image, segments, searcher.candidates(segments), shown)
+        sight = Sight(image, segments, searcher.candidates(segments, told), shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
