@@ -75,9 +75,9 @@ _BETTER = 0.15
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
 _FOREIGN = 0.25
-# Of the poses that an image leaves open besides those that hold so many are laid on the next; on
-# a map with many places alike its own search finds the others again.
-_CARRIED = 12
+# Of the poses among which an image does not decide so many are laid on the next; on a map with
+# many places alike its own search finds the others again.
+_CARRIED = 8
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
 
@@ -286,9 +286,10 @@ class Localiser:
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
         hypotheses = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
-        others = (*hypotheses[1:], *(
-            Hypothesis(c.pose, (c.score,)) for c in sifted.open[:_CARRIED]))
-        hypotheses = (hypotheses[0], *sorted(others, key=lambda h: -h.mean))
+        others = sorted(
+            (*hypotheses[1:], *(Hypothesis(c.pose, (c.score,)) for c in sifted.open)),
+            key=lambda h: -h.mean)
+        hypotheses, more = (hypotheses[0], *others[:_CARRIED - 1]), others[_CARRIED - 1:]
         if lines_used(held[0].alignment) < 3:
             hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
         self._open, self._open_odometry = hypotheses, now
@@ -298,7 +299,7 @@ class Localiser:
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
-        return self._undecided(stamp_ns, held, sifted.open[_CARRIED:], watch)
+        return self._undecided(stamp_ns, held, more, watch)
 
     def _trusted(
         self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,
@@ -381,7 +382,7 @@ class Localiser:
             quality, watch.times)
 
     def _undecided(
-        self, stamp_ns: int, held: list[Found], more: list[Candidate], watch: _Stopwatch,
+        self, stamp_ns: int, held: list[Found], more: list[Hypothesis], watch: _Stopwatch,
     ) -> Estimate:
         """Say which poses may be right, and give none of them.
 
@@ -389,7 +390,7 @@ class Localiser:
         """
         hypotheses = self._open
         poses = tuple(sorted(
-            (*(Candidate(h.pose, h.mean) for h in hypotheses), *more), key=lambda c: -c.score))
+            (Candidate(h.pose, h.mean) for h in (*hypotheses, *more)), key=lambda c: -c.score))
         ratio = ambiguity(hypotheses)
         best = held[0].alignment
         quality = quality_of(

@@ -127,11 +127,10 @@ class Sifter:
 
         :param doubts: lines that were seen beside their place and not in it since.
         :param told: where the robot is by something else than the image, which can decide between
-            equal poses: those that are there come first. Without it and without hypotheses two
-            equal poses are enough to know that the image does not decide.
+            equal poses: those that are there come first. Without it two equal poses are enough to
+            know that the image does not decide, and of the others only hypotheses are laid on it.
         """
         options = self._options
-        open_end = told is None and not hypotheses
         candidates = sight.candidates
         if told is not None and len(candidates) > _TRIED:
             candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
@@ -143,13 +142,13 @@ class Sifter:
         doubtful: list[Found] = []
         seen: list[Pose2] = []
         best: tuple[_Start, Found] | None = None
-        # What holds adds its twins to the end of the queue.
         for start in starts:
             if best is not None and not self._rivals(start, *best):
                 continue
             if any(same_pose(start.pose, pose) for pose in seen):
                 continue
-            if open_end and len(self._equals(sifted.held)) > 1:
+            if told is None and start.strips is not None and len(
+                    self._equals(sifted.held)) > 1:
                 left.append(start)
                 continue
             verdict = self._verdict(sight, start, doubts, prediction, seen)
@@ -166,9 +165,10 @@ class Sifter:
                     sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
                 continue
             sifted.held.append(found)
+            # On the image the twins of what holds are what it is itself.
             for twin in (_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries):
-                elsewhere = told is not None and not told.holds(twin.pose)
-                (left if elsewhere else starts).append(twin)
+                there = told is not None and told.holds(twin.pose)
+                (starts if there else left).append(twin)
             if best is None or found.score > best[1].score:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)
