@@ -261,7 +261,9 @@ class Localiser:
             sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction, told)
             watch.lap('measure')
             refusals += sifted.refused
-            if sifted.held:
+            # What was tried early is no place to be alone in.
+            if sifted.held and (
+                    sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
                 break
         held = sifted.held
         self._in_vain = 0 if held else self._in_vain + 1

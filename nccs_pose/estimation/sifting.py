@@ -45,6 +45,8 @@ _SHARP = 0.8
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
+# A pose that explains this part of the strips leaves none unexplained.
+_ALL_STRIPS = 0.95
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 
@@ -198,15 +200,18 @@ class Sifter:
                 sifted.open.append(Candidate(pose, min(found.score, best.score)))
             else:
                 sifted.hidden.append(Candidate(pose, found.by_strips))
-        # Candidates differ among themselves; the twins of what holds need not differ from them.
-        seen = list(seen)
-        for start in sorted(left, key=lambda start: start.strips is not None):
-            share = 1.0 if start.strips is None else min(
-                start.strips.score / best.by_strips, 1.0)
-            if share >= ratio and not any(same_pose(start.pose, pose) for pose in seen):
-                if start.strips is None:
-                    seen.append(start.pose)
-                sifted.open.append(Candidate(start.pose, share * best.score))
+        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
+        twins, seen = [found.alignment.pose for found in sifted.held], list(seen)
+        for start in (start for start in left if start.strips is None):
+            if not any(same_pose(start.pose, pose) for pose in twins):
+                twins.append(start.pose)
+                sifted.open.append(Candidate(start.pose, best.score))
+        seen += twins
+        # Candidates differ among themselves.
+        for strips in (start.strips for start in left if start.strips is not None):
+            share = min(strips.score / best.by_strips, 1.0)
+            if share >= ratio and not any(same_pose(strips.pose, pose) for pose in seen):
+                sifted.open.append(Candidate(strips.pose, share * best.score))
         sifted.open.sort(key=lambda candidate: -candidate.score)
 
     def _verdict(
@@ -262,12 +267,14 @@ class Sifter:
 
         No pose scores more on the image than the root of what it scores on the strips, times
         what is left of that by how far they lie off its lines; and where the strips show all that
-        the pose that holds expects, and nothing else, they tell rivals as well as the image.
+        the pose that holds expects, and nothing else, they tell rivals as well as the image: but
+        for one that leaves no strip unexplained, of which more may be there than the strips show.
         """
         if start.strips is None:
             return True
         ratio, score = self._options.ambiguity_ratio, start.strips.score
-        if explains_nearly_all(held) and score < ratio * held.by_strips:
+        if explains_nearly_all(held) and score < ratio * held.by_strips and (
+                start.strips.claimed < _ALL_STRIPS):
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
         return math.sqrt(score) * fit_of(excess) >= ratio * held.score

@@ -79,7 +79,8 @@ def sights(
 ) -> Iterator[Sight]:
     """What is worth a try: every look that is promising or, if none is, the best.
 
-    So is one at which many places look the same.
+    So is one at which many places look the same: it may show at once that it decides nothing, but
+    is tried again at last if it seemed to decide.
 
     What is given is to be tried before the next is asked for.
 
@@ -105,8 +106,9 @@ def sights(
         elif shown is not colours:
             # What tapes look like was learned, if not more of them found.
             sight = best = replace(best, colours=shown)
-        if sight.is_promising or sight.is_repeated:
+        if sight.is_promising:
             tried.append(sight)
+        if sight.is_promising or sight.is_repeated:
             yield sight
         if len(tried) > 1 and best.promise > _PLAIN:
             return
