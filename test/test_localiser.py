@@ -214,14 +214,18 @@ def test_driving_on_decides_between_equal_poses() -> None:
     assert answers[-1].state is State.TRACKING
 
 
-def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
-    """Bays along two walls of a hall: far more places look alike than are looked at closely."""
+def _hall_of_bays() -> tuple[Scene, Localiser]:
     bays = [_line((x, y), (x, y + 2.0)) for x in np.arange(-13.8, 14.0, 1.2) for y in (0.0, 3.0)]
     hall = LineMap((_line((-14.4, 0.0), (14.4, 0.0)), _line((-14.4, 5.0), (14.4, 5.0)), *bays))
     assert len(hall) == 50
     look = replace(arena_scene(640).appearance, room=None, obstacles=())
     scene = replace(arena_scene(640), line_map=hall, appearance=look)
-    localiser = Localiser(scene.rig, hall)
+    return scene, Localiser(scene.rig, hall)
+
+
+def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
+    """Bays along two walls of a hall: far more places look alike than are looked at closely."""
+    scene, localiser = _hall_of_bays()
     rng = np.random.default_rng(21)
     states = []
     for k in range(12):
@@ -232,6 +236,22 @@ def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
         states.append(estimate.state)
         assert estimate.pose is None
     assert states.count(State.AMBIGUOUS) >= 8
+
+
+def test_driving_along_a_wall_of_bays_takes_none_for_the_last() -> None:
+    """At the end of the hall little is expected: no reason to rest there on what fits anywhere."""
+    scene, localiser = _hall_of_bays()
+    scene = replace(scene, appearance=replace(scene.appearance, light_gradient=(0.0, 0.0)))
+    # Noise in which the last place, but not the one next to it, was taken at the second image.
+    rng = np.random.default_rng([5, 2])
+    rng.random(4)
+    rng.choice(2)
+    rng.random(3)
+    pose = Pose2(2.0145772573108767, 2.5, 0.0)
+    for k in range(4):
+        localiser.add_odometry((k + 1) * PERIOD_NS, pose)
+        assert localiser.process((k + 1) * PERIOD_NS, render(scene, pose, rng)).pose is None
+        pose = pose @ Pose2(0.7, 0.0, 0.02)
 
 
 def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
