@@ -24,6 +24,7 @@ from nccs_pose.estimation.association import (
     map_symmetries,
     same_pose,
 )
+from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines
@@ -230,6 +231,35 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
         assert part < claimed
 
 
+def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
+    crosses = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
+    line_map = LineMap(tuple(
+        line for x, y in crosses
+        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+    pose = Pose2(12.3, 6.4, 0.7)
+    strips = _strips(line_map, pose, np.random.default_rng(25))
+    candidates = Associator(line_map, table).candidates(strips)
+    assert all(a.score >= b.score for a, b in itertools.pairwise(candidates))
+    # Wherever all that is in view is there as well.
+    inner = [Pose2(pose.x + 3.0 * i, pose.y + 3.0 * j, pose.yaw)
+             for i in range(-3, 4) for j in range(-1, 2)]
+    for place in inner:
+        told = [c for c in candidates if _near(c.pose, place, 0.25, 0.1)]
+        assert len(told) == 1 and told[0].score > 0.8 * candidates[0].score
+    assert len(candidates) <= 300
+
+
+def test_one_strip_across_many_heavier_ones_is_enough(table: FloorTable) -> None:
+    spacing = np.cumsum([0.0, 0.3, 0.35, 0.25, 0.4, 0.3, 0.45, 0.3, 0.5])
+    line_map = LineMap((
+        *(_line((-1.5, -1.2 + y), (1.5, -1.2 + y)) for y in spacing.tolist()),
+        _line((1.7, -0.4), (1.75, 0.1))))
+    pose = Pose2(0.1, -0.2, 0.4)
+    strips = _strips(line_map, pose, np.random.default_rng(26))
+    assert not _cross(strips[:6]) and _cross(strips)
+    assert _near(Associator(line_map, table).candidates(strips)[0].pose, pose)
+
+
 def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -> None:
     line_map = LineMap((
         _line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5)),
@@ -276,7 +306,7 @@ def test_the_nearest_line_is_that_of_an_exhaustive_search() -> None:
         assert known.sum() > 250
         np.testing.assert_allclose(np.abs(across[0, known]), distances[0][known], atol=1e-12)
         assert (np.array(lines.colour)[which[0, known]] == colour).all()
-        assert np.isinf(across[0, distances[1] > 1.1]).all()
+        assert (np.abs(across[0, distances[1] > 1.1]) > 1e6).all()
         assert (which[0, distances[1] > 1.1] == len(line_map)).all()
 
 
@@ -359,8 +389,10 @@ def _segments(
     if hide is not None:
         image[:, hide] = 205
     mask = chromatic_mask(image, 'green', 4.5, 0.05, 31)
+    v, u = np.indices(mask.shape).reshape(2, -1)
     return floor_segments(
-        find_blobs(mask & table.region, 400), table, WIDTH, 'green',
+        find_blobs(mask & table.region, 400),
+        PixelFloor(np.column_stack([u, v]), 1, table), WIDTH, 'green',
         longest=max(line.length for line in line_map))
 
 

@@ -48,6 +48,9 @@ def _closed(*corners: tuple[float, float]) -> tuple[Line, ...]:
 
 RECTANGLE = LineMap(_closed((-2.0, -1.4), (2.0, -1.4), (2.0, 1.4), (-2.0, 1.4)))
 SQUARE = LineMap(_closed((-1.3, -1.3), (1.3, -1.3), (1.3, 1.3), (-1.3, 1.3)))
+GRID = LineMap((
+    *(_line((-8.0, y), (8.0, y), f'along {y}') for y in np.arange(-8.0, 8.5, 2.0)),
+    *(_line((x, -8.0), (x, 8.0), f'across {x}') for x in np.arange(-8.0, 8.5, 2.0))))
 
 
 class Drive:
@@ -211,14 +214,18 @@ def test_driving_on_decides_between_equal_poses() -> None:
     assert answers[-1].state is State.TRACKING
 
 
-def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
-    """Bays along two walls of a hall: far more places look alike than are looked at closely."""
+def _hall_of_bays() -> tuple[Scene, Localiser]:
     bays = [_line((x, y), (x, y + 2.0)) for x in np.arange(-13.8, 14.0, 1.2) for y in (0.0, 3.0)]
     hall = LineMap((_line((-14.4, 0.0), (14.4, 0.0)), _line((-14.4, 5.0), (14.4, 5.0)), *bays))
     assert len(hall) == 50
     look = replace(arena_scene(640).appearance, room=None, obstacles=())
     scene = replace(arena_scene(640), line_map=hall, appearance=look)
-    localiser = Localiser(scene.rig, hall)
+    return scene, Localiser(scene.rig, hall)
+
+
+def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
+    """Bays along two walls of a hall: far more places look alike than are looked at closely."""
+    scene, localiser = _hall_of_bays()
     rng = np.random.default_rng(21)
     states = []
     for k in range(12):
@@ -229,6 +236,51 @@ def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
         states.append(estimate.state)
         assert estimate.pose is None
     assert states.count(State.AMBIGUOUS) >= 8
+
+
+def test_driving_along_a_wall_of_bays_takes_none_for_the_last() -> None:
+    """At the end of the hall little is expected: no reason to rest there on what fits anywhere."""
+    scene, localiser = _hall_of_bays()
+    scene = replace(scene, appearance=replace(scene.appearance, light_gradient=(0.0, 0.0)))
+    # Noise in which the last place, but not the one next to it, was taken at the second image.
+    rng = np.random.default_rng([5, 2])
+    rng.random(4)
+    rng.choice(2)
+    rng.random(3)
+    pose = Pose2(2.0145772573108767, 2.5, 0.0)
+    for k in range(4):
+        localiser.add_odometry((k + 1) * PERIOD_NS, pose)
+        assert localiser.process((k + 1) * PERIOD_NS, render(scene, pose, rng)).pose is None
+        pose = pose @ Pose2(0.7, 0.0, 0.02)
+
+
+def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
+    scene = replace(SCENE, line_map=GRID)
+    pose = Pose2(0.3, -0.4, 0.3)
+    estimate = Localiser(scene.rig, GRID).process(0, render(scene, pose, np.random.default_rng(0)))
+    assert estimate.state is State.AMBIGUOUS and estimate.pose is None
+    scores = [candidate.score for candidate in estimate.candidates]
+    assert scores == sorted(scores, reverse=True)
+    # The robot, and where it is by each quarter of a turn, wherever what it sees may be.
+    for turn in np.arange(4) * np.pi / 2.0:
+        for x, y in itertools.product((-2.0, 0.0, 2.0), repeat=2):
+            place = Pose2(x, y, float(turn)) @ pose
+            # What is not laid on the image is told as it was guessed.
+            assert any(math.hypot(c.pose.x - place.x, c.pose.y - place.y) < 0.2 and abs(
+                float(wrap_angle(c.pose.yaw - place.yaw))) < 0.1 for c in estimate.candidates)
+
+
+@pytest.mark.parametrize(('sigma', 'state'), [(0.15, State.TRACKING), (0.6, State.AMBIGUOUS)])
+def test_a_pose_that_is_given_decides_between_many_places(sigma: float, state: State) -> None:
+    """If it is good enough to tell a place from the next one, two metres away."""
+    scene = replace(SCENE, line_map=GRID)
+    pose = Pose2(-1.7, 1.6, 0.3)
+    localiser = Localiser(scene.rig, GRID)
+    localiser.set_prior(pose @ Pose2(0.2, -0.1, 0.05), np.diag([sigma, sigma, 0.1])**2)
+    estimate = localiser.process(0, render(scene, pose, np.random.default_rng(0)))
+    assert estimate.state is state
+    if state is State.TRACKING:
+        assert estimate.pose is not None and _near(estimate.pose, pose)
 
 
 # ---------------------------------------------------------------- kidnapping

@@ -28,17 +28,19 @@ from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, poses_of_pairs, StripLines
+from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.small_matrices import definite_solutions
 import numpy as np
 from numpy.typing import NDArray
 
-# Strips that start hypotheses; of these so many are looked at closely, by every third sample of
-# the strips, and so many are refined.
-_SEEDS = 6
-_CLOSE = 200
+# Pairs of strips that start hypotheses; of these so many are looked at closely, by every third
+# sample of the strips, and so many are refined. No more than these are told.
+_PAIRS = 15
+_CLOSE = 300
 _COARSE = 3
 _REFINED = 24
 _ROUNDS = 2
@@ -48,6 +50,8 @@ _SAMPLES = 12
 _LONGEST_SAMPLE = 60.0
 # Fewer samples than this on lines refine no pose.
 _LEAST_SAMPLES = 4
+# What keeps a direction that no sample fixes where it is.
+_DAMPING = 1e-6 * np.eye(3)
 # Tapes whose ends are this close look the same, metres.
 _SAME_TAPE = 0.05
 # Poses this close are the same, metres and rad.
@@ -59,10 +63,13 @@ _SAME_YAW = 0.15
 class FittedCandidate(Candidate):
     """A pose that explains strips.
 
-    :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px.
+    :ivar claimed: fraction of the strips' pixels that lie on map lines.
+    :ivar misfit: how far the strips lie off the lines that it lays them on, root mean square, px;
+        0 where it is not known.
     """
 
-    misfit: float
+    claimed: float
+    misfit: float = 0.0
 
 
 class Associator:
@@ -78,25 +85,42 @@ class Associator:
         self._last: _Scorer | None = None
 
     def candidates(
-        self, segments: tuple[FloorSegment, ...], most: int = 8,
+        self, segments: tuple[FloorSegment, ...], told: Told | None = None,
     ) -> tuple[FittedCandidate, ...]:
-        """Poses that explain strips, best first; none where fewer than two strips cross."""
+        """Poses that explain strips, best first; none where fewer than two strips cross.
+
+        The best few are laid on the strips by least squares; where a map has many places alike
+        the others follow as they were guessed, with what they score there.
+
+        :param told: where the robot is by something else; poses there are not left out for others
+            that explain as much.
+        """
         if len(segments) < 2:
             return ()
         scorer = self._scorer(segments)
-        poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _SEEDS))
+        poses = _Poses(*poses_of_pairs(scorer.strips, self._place.lines, _PAIRS))
         if len(poses.place) == 0:
             return ()
-        if len(poses.place) > _CLOSE:
-            poses = poses[np.argsort(-scorer.claimed(poses, _COARSE), kind='stable')[:_CLOSE]]
+        guessed: list[FittedCandidate] = []
         if len(poses.place) > _REFINED:
-            poses = poses[_distinct(poses, scorer.score(poses, _COARSE), _REFINED)]
-        poses = scorer.refined(poses)
-        claimed, misfit = scorer.fit(poses)
+            claimed = scorer.claimed(poses, _COARSE)
+            there = np.zeros(len(claimed), dtype=bool) if told is None else (
+                told.holds_guesses(poses.place, poses.rotation))
+            best = np.lexsort([-claimed, ~there])
+            if len(best) > _CLOSE:
+                best = _one_of_each(poses, best)[:_CLOSE]
+            poses, claimed, there = poses[best], claimed[best], there[best]
+            score = _harmonic(claimed, scorer.explained(poses, _COARSE))
+            found = sorted(_distinct(poses, score), key=lambda k: not there[k])
+            guessed = [FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]))
+                       for k in found[_REFINED:]]
+            poses = poses[found[:_REFINED]]
+        poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
-        return tuple(
-            FittedCandidate(poses.pose(k), float(score[k]), float(misfit[k]))
-            for k in _distinct(poses, score, most))
+        refined = [
+            FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]), float(misfit[k]))
+            for k in _distinct(poses, score)]
+        return tuple(sorted((*refined, *guessed), key=lambda c: -c.score))
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
         """The score that a pose would have among the candidates, and the strips' part in it.
@@ -194,9 +218,10 @@ class _Scorer:
         self._layer = np.repeat(place.nearest.layers(strips.colour), _SAMPLES)
         # Where a point x, y, 1 is along each strip and across it, within 1 if it lies in it.
         frames = np.stack([strips.direction / (0.5 * strips.length + BEYOND),
-                           1j * strips.direction / tolerance], axis=1).ravel()
-        middle = np.repeat(strips.middle, 2)
-        self._frames = np.stack([frames.real, frames.imag, -(frames * middle.conj()).real])
+                           1j * strips.direction / tolerance])
+        self._frames = np.stack([
+            frames.real, frames.imag, -(frames * strips.middle.conj()).real],
+            axis=2).reshape(-1, 3).astype(np.float32)
 
     def _on_lines(
         self, poses: _Poses, step: int = 1,
@@ -215,16 +240,6 @@ class _Scorer:
         on, _, _ = self._on_lines(poses, step)
         weight = self._weight[step // 2::step]
         return on @ (weight / weight.sum())
-
-    def fit(self, poses: _Poses) -> tuple[Array, Array]:
-        """Fraction of the strips' pixels on map lines (H,), and how far off these they are.
-
-        :returns: the fraction, and the root mean square distance (H,), px; 0 if none is on any.
-        """
-        on, _, across = self._on_lines(poses)
-        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
-        total = on @ self._weight
-        return total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
 
     def explained(self, poses: _Poses, step: int = 1) -> Array:
         """Fraction of the map lines in view that strips lie on (H,).
@@ -247,42 +262,62 @@ class _Scorer:
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
         weight = np.minimum(
             self._scale.pixels(points, (length / _SAMPLES * along)[:, None]), _LONGEST_SAMPLE)
-        x, y = points.real.ravel(), points.imag.ravel()
-        on = np.abs(np.stack([x, y, np.ones(len(x))], axis=1) @ self._frames) < 1.0
-        on = on[:, ::2] & on[:, 1::2]
-        covered = np.where(on.any(axis=1).reshape(weight.shape), weight, 0.0)
+        at = np.ones((3, *points.shape), np.float32)
+        at[0], at[1] = points.real, points.imag
+        off = self._frames @ at.reshape(3, -1)
+        inside = np.abs(off, out=off) < 1.0
+        on = (inside[:len(inside) // 2] & inside[len(inside) // 2:]).any(axis=0)
+        covered = weight * on.reshape(weight.shape)
         count = len(poses.place)
         total = np.bincount(pose, weight.sum(axis=1), count)
         return np.bincount(pose, covered.sum(axis=1), count) / np.maximum(total, 1e-9)
 
-    def score(self, poses: _Poses, step: int = 1) -> Array:
-        """Harmonic mean of both fractions (H,)."""
-        return _harmonic(self.claimed(poses, step), self.explained(poses, step))
+    def refined(self, poses: _Poses) -> tuple[_Poses, Array, Array]:
+        """Lay the strips on their lines by least squares on the floor, from poses (H,).
 
-    def refined(self, poses: _Poses) -> _Poses:
-        """Lay the strips on their lines by least squares on the floor, from poses (H,)."""
+        :returns: the poses, the fraction of the strips' pixels on map lines (H,), and the root
+            mean square distance of these (H,), px; 0 if none is on any. Of a last step that is
+            small enough both are as it says that they will be.
+        """
         inverse = 1.0 / self._tolerance
+        count = len(poses.place)
+        rows = np.empty((count, 4, len(inverse)))
         for _ in range(_ROUNDS):
             on, which, across = self._on_lines(poses)
             weight = on * inverse
-            normal = self._nearest.normal[which] * weight
+            normal = self._nearest.normal.take(which) * weight
             turned = poses.rotation[:, None] * self._points
-            # Derivatives of the distances by x, y and yaw.
-            jacobian = np.stack([normal.real, normal.imag, (normal * turned.conj()).imag], axis=1)
-            matrix = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
-            error = np.where(on, across, 0.0) * weight
-            step = np.linalg.solve(matrix, jacobian @ error[..., None])[..., 0]
+            # Derivatives of the distances by x, y and yaw, and the distances.
+            rows[:, 0], rows[:, 1] = normal.real, normal.imag
+            rows[:, 2] = (normal * turned.conj()).imag
+            np.multiply(across, weight, out=rows[:, 3])
+            products = rows @ rows.transpose(0, 2, 1)
+            step = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
             step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
             poses = _Poses(poses.rotation * np.exp(-1j * step[:, 2]),
                            poses.place - step[:, 0] - 1j * step[:, 1])
-        return poses
+        across -= (step[:, None] @ rows[:, :3])[:, 0] * self._tolerance
+        on &= np.abs(across) < self._tolerance
+        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
+        total = on @ self._weight
+        return poses, total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
 
 
 def _harmonic(a: Array, b: Array) -> Array:
     return 2.0 * a * b / np.maximum(a + b, 1e-9)
 
 
-def _distinct(poses: _Poses, score: Array, most: int) -> list[int]:
+def _one_of_each(poses: _Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Of poses in an order (H,) the first in each cell of places and headings."""
+    cells = np.rint(np.stack([
+        poses.place.real / _SAME_PLACE, poses.place.imag / _SAME_PLACE,
+        np.angle(poses.rotation) / _SAME_YAW])[:, order]).astype(np.int64)
+    # Cells in a row: a map has far fewer than this a side.
+    _, first = np.unique(cells[0] + (cells[1] << 20) + (cells[2] << 40), return_index=True)
+    return order[np.sort(first)]
+
+
+def _distinct(poses: _Poses, score: Array) -> list[int]:
     """The best of each group of poses that are the same, best first."""
     order = np.argsort(-score, kind='stable')
     place, rotation = poses.place[order], poses.rotation[order]
@@ -290,7 +325,7 @@ def _distinct(poses: _Poses, score: Array, most: int) -> list[int]:
     same &= (rotation * rotation[:, None].conj()).real > math.cos(_SAME_YAW)
     found: list[int] = []
     left = np.ones(len(order), dtype=bool)
-    while len(found) < most and left.any():
+    while left.any():
         first = int(left.argmax())
         found.append(int(order[first]))
         left &= ~same[first]

@@ -50,20 +50,6 @@ class FloorPoints:
     blob: NDArray[np.intp]
     weight: Array
 
-    @classmethod
-    def of(cls, segmentation: Segmentation, table: FloorTable, width: float) -> FloorPoints:
-        """Lay blobs on the floor, for tapes of a width in metres."""
-        points, jacobian = table.floor(segmentation.pixels)
-        x, y = jacobian[:, 0], jacobian[:, 1]
-        spread = np.empty((len(points), 3))
-        for k, (one, other) in enumerate(((x, x), (x, y), (y, y))):
-            np.einsum('pi,pi->p', one, other, out=spread[:, k])
-        spread *= segmentation.pitch**2
-        precision = 1.0 / (spread[:, 0] + spread[:, 2] + 0.1 * width**2)
-        floor = np.ones((len(points), 3))
-        floor[:, :2] = points
-        return cls(floor, spread, precision, segmentation.label, segmentation.weight)
-
     def __getitem__(self, index: NDArray[np.intp] | slice) -> FloorPoints:
         return FloorPoints(
             self.floor[index], self.spread[index], self.precision[index], self.blob[index],
@@ -98,6 +84,30 @@ class FloorPoints:
             np.square(distance, out=distance)
             np.less_equal(distance, spread[block] @ by_spread, out=near[block], casting='unsafe')
         return near
+
+
+class PixelFloor:
+    """The floor behind every pixel of a view of the image, laid out once."""
+
+    def __init__(self, pixels: Array, pitch: int, table: FloorTable) -> None:
+        """Lay out.
+
+        :param pixels: of the view, row by row (M, 2), in the image.
+        :param pitch: their side, px of the image.
+        """
+        points, jacobian = table.floor(pixels)
+        spread = jacobian @ jacobian.transpose(0, 2, 1)
+        spread *= pitch**2
+        self._floor = np.column_stack([points, spread[:, 0], spread[:, 1, 1]])
+
+    def points(self, segmentation: Segmentation, width: float) -> FloorPoints:
+        """What blobs of the view are on the floor, for tapes of a width in metres."""
+        found = self._floor.take(segmentation.place, axis=0)
+        floor = np.ones((len(found), 3))
+        floor[:, :2] = found[:, :2]
+        spread = found[:, 2:]
+        precision = 1.0 / (spread[:, 0] + spread[:, 2] + 0.1 * width**2)
+        return FloorPoints(floor, spread, precision, segmentation.label, segmentation.weight)
 
 
 @dataclass(frozen=True)

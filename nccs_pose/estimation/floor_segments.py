@@ -28,9 +28,9 @@ from nccs_pose.estimation.floor_points import (
     FloorLine,
     FloorPoints,
     misplaced,
+    PixelFloor,
     principal_lines,
 )
-from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.segment import Segmentation, upper_median
 import numpy as np
@@ -95,11 +95,12 @@ class FloorSegment:
 
 
 def floor_segments(
-    segmentation: Segmentation, table: FloorTable, width: float, colour: str, most: int = 16,
+    segmentation: Segmentation, floor: PixelFloor, width: float, colour: str, most: int = 16,
     longest: float = math.inf,
 ) -> tuple[FloorSegment, ...]:
     """Straight strips among the blobs, those of most pixels first.
 
+    :param floor: behind the pixels of the blobs' mask.
     :param width: width of the tapes, metres.
     :param longest: length of the longest of them, metres.
     :param colour: their colour class.
@@ -107,7 +108,7 @@ def floor_segments(
     """
     if len(segmentation.pixels) == 0:
         return ()
-    points = FloorPoints.of(segmentation, table, width)
+    points = floor.points(segmentation, width)
     normals, offsets, kept = _candidates(points, width)
     if len(normals) == 0:
         return ()
@@ -217,7 +218,7 @@ def _strip(
         of its blobs that lie just beside it; None where too little is left.
     """
     for _ in range(2):
-        line = FloorLine.through(points.moments[inside].sum(axis=0))
+        line = FloorLine.through(points.moments.take(inside, axis=0).sum(axis=0))
         along, beyond = line.places(points, width)
         before = inside
         inside = np.flatnonzero((beyond < 0.0) & free)
@@ -225,7 +226,7 @@ def _strip(
             inside = _longest_run(points, along, inside, _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
-        if np.array_equal(inside, before):
+        if len(inside) == len(before) and bool((inside == before).all()):
             break
     low, high = along[inside].min(), along[inside].max()
     if high - low < _LEAST_LENGTH:

@@ -20,6 +20,7 @@ from collections.abc import Iterable, Set
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment, close
+from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.misplaced import placement, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
@@ -130,13 +131,17 @@ class Judge:
     def found(
         self, image: NDArray[np.uint8], alignment: Alignment,
         segments: tuple[FloorSegment, ...], doubts: Set[int], *, expected: bool,
+        strips: FittedCandidate | None = None,
     ) -> Found | Objection:
-        """Judge a pose by the whole image."""
+        """Judge a pose by the whole image.
+
+        :param strips: what these say of it, if that is known.
+        """
         against = (self.objection(image, alignment, doubts, expected=expected)
                    or contradiction(alignment, segments, self._map))
         if against is not None:
             return against
-        found = self.measured(alignment, segments)
+        found = self.measured(alignment, segments, strips)
         if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
             return Objection('the lines that it rests on do not fix a pose')
         used = lines_used(alignment)
@@ -147,9 +152,13 @@ class Judge:
                 f'it rests on {used} lines and leaves too much unexplained', hidden=True)
         return found
 
-    def measured(self, alignment: Alignment, segments: tuple[FloorSegment, ...]) -> Found:
-        """How much a pose explains, whether it holds or not."""
-        score, claimed = self._searcher.score(alignment.pose, segments)
+    def measured(
+        self, alignment: Alignment, segments: tuple[FloorSegment, ...],
+        strips: FittedCandidate | None = None,
+    ) -> Found:
+        """How much a pose explains, whether it holds or not; see :meth:`found`."""
+        score, claimed = (strips.score, strips.claimed) if strips is not None else (
+            self._searcher.score(alignment.pose, segments))
         return Found(
             alignment, claimed, float(np.sqrt(score * alignment.explained)) * fit_of(
                 float(np.mean(alignment.points.sigma**2))),

@@ -27,7 +27,7 @@ from dataclasses import replace
 import time
 
 from nccs_pose.estimation.admission import Admission
-from nccs_pose.estimation.alignment import Aligner, Alignment, close
+from nccs_pose.estimation.alignment import Aligner, Alignment
 from nccs_pose.estimation.association import map_symmetries, same_pose
 from nccs_pose.estimation.estimate import (
     Candidate,
@@ -59,6 +59,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sifting import Refused, Sifter
 from nccs_pose.estimation.sights import sights
+from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -75,6 +76,9 @@ _BETTER = 0.15
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
 _FOREIGN = 0.25
+# Of the poses among which an image does not decide so many are laid on the next; on a map with
+# many places alike its own search finds the others again.
+_CARRIED = 8
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
 
@@ -124,8 +128,7 @@ class Localiser:
         self._aligner = Aligner(self._table, self._map, options)
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
-        self._sifter = Sifter(
-            self._aligner, self._judge, self._searcher, self._symmetries, options)
+        self._sifter = Sifter(self._aligner, self._judge, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""
@@ -252,16 +255,17 @@ class Localiser:
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         hypotheses = carried(self._open, self._open_odometry, self._now)
+        told = self._told(prediction)
         refusals: list[Refused] = []
         for sight in sights(
-                image, self._searcher, self._fresh_colours(), self._in_vain, watch.lap):
+                image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
             segments = sight.segments
-            sifted = self._sifter.sift(
-                sight, hypotheses, self._doubts, prediction, told=self._prior is not None
-                or prediction is not None or bool(hypotheses))
+            sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction, told)
             watch.lap('measure')
             refusals += sifted.refused
-            if sifted.held:
+            # What was tried early is no place to be alone in.
+            if sifted.held and (
+                    sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
                 break
         held = sifted.held
         self._in_vain = 0 if held else self._in_vain + 1
@@ -278,7 +282,7 @@ class Localiser:
             if refused.objection is None and refusals:
                 refused = refusals[0]
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = self._decide(held, prediction)
+        chosen = self._decide(held, sifted.open, prediction, told)
         if chosen is not None:
             words = 'found by searching the whole image'
             if len(held) > 1:
@@ -286,8 +290,10 @@ class Localiser:
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
         hypotheses = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
-        others = (*hypotheses[1:], *(Hypothesis(c.pose, (c.score,)) for c in sifted.open))
-        hypotheses = (hypotheses[0], *sorted(others, key=lambda h: -h.mean))
+        others = sorted(
+            (*hypotheses[1:], *(Hypothesis(c.pose, (c.score,)) for c in sifted.open)),
+            key=lambda h: -h.mean)
+        hypotheses, more = (hypotheses[0], *others[:_CARRIED - 1]), others[_CARRIED - 1:]
         if lines_used(held[0].alignment) < 3:
             hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
         self._open, self._open_odometry = hypotheses, self._now
@@ -297,7 +303,7 @@ class Localiser:
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
-        return self._undecided(stamp_ns, held, watch)
+        return self._undecided(stamp_ns, held, more, watch)
 
     def _trusted(
         self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,
@@ -312,16 +318,34 @@ class Localiser:
         _, claimed = self._searcher.score(followed.alignment.pose, segments)
         return (replace(followed, claimed=claimed), given) if claimed >= _CLAIMED else None
 
-    def _decide(self, held: list[Found], prediction: Prediction | None) -> Found | None:
-        """The one pose that a prior or the prediction expects, if it is one of the best."""
-        good = [f for f in held if f.score >= self.options.ambiguity_ratio * held[0].score]
+    def _told(self, prediction: Prediction | None) -> Told | None:
+        """Where a prior or the prediction says that the robot is."""
         if self._prior is not None:
-            pose, covariance = self._prior
-            near = [f for f in good if close(
-                f.alignment.pose, pose, covariance + f.alignment.covariance, _PRIOR_GATE)]
-        else:
-            near = [f for f in good if self._expected(f.alignment, prediction)]
-        return near[0] if len(near) == 1 else None
+            return Told(*self._prior, _PRIOR_GATE)
+        if prediction is not None:
+            return Told(prediction.pose, prediction.covariance, self.options.innovation_gate)
+        return None
+
+    def _decide(
+        self, held: list[Found], left: list[Candidate], prediction: Prediction | None,
+        told: Told | None,
+    ) -> Found | None:
+        """The one pose that a prior or the prediction expects, if it is one of the best of all.
+
+        :param left: poses that may explain the image as well, but were not laid on it.
+        """
+        if told is None:
+            return None
+        near = [f for f in held if (
+            told.holds(f.alignment.pose, f.alignment.covariance) if self._prior is not None
+            else self._expected(f.alignment, prediction))]
+        if not near or any(told.holds(c.pose) for c in left):
+            return None
+        best, ratio = near[0], self.options.ambiguity_ratio
+        if best.score < ratio * held[0].score or any(
+                f.score >= ratio * best.score for f in near[1:]):
+            return None
+        return best
 
     def _tracking(
         self, stamp_ns: int, found: Found, prior: Prediction | None, watch: _Stopwatch,
@@ -360,10 +384,16 @@ class Localiser:
             tuple(Candidate(f.alignment.pose, f.score) for f in ranked), alignment.points,
             quality, watch.times)
 
-    def _undecided(self, stamp_ns: int, held: list[Found], watch: _Stopwatch) -> Estimate:
-        """Say which poses may be right, and give none of them."""
+    def _undecided(
+        self, stamp_ns: int, held: list[Found], more: list[Hypothesis], watch: _Stopwatch,
+    ) -> Estimate:
+        """Say which poses may be right, and give none of them.
+
+        :param more: that are not carried on.
+        """
         hypotheses = self._open
-        poses = tuple(Candidate(h.pose, h.mean) for h in hypotheses)
+        poses = tuple(sorted(
+            (Candidate(h.pose, h.mean) for h in (*hypotheses, *more)), key=lambda c: -c.score))
         ratio = ambiguity(hypotheses)
         quality = _quality(held[0], ratio)
         if ratio > self.options.ambiguity_ratio:

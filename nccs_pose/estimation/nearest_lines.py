@@ -29,6 +29,8 @@ _CELL = 0.05
 _MOST_CELLS = 4e6
 # Further from all lines than this nothing is near, metres.
 _NEAR = 1.0
+# So far off is no line, metres: beyond all tolerance, but a number to reckon with.
+_NOWHERE = 1e9
 
 
 class NearestLines:
@@ -42,8 +44,8 @@ class NearestLines:
 
     def __init__(self, lines: FloorLines) -> None:
         self.normal = np.append(1j * lines.direction, 0.0)
-        # No line is beyond all tolerance.
-        self._offset = np.append((lines.start * (1j * lines.direction).conj()).real, np.inf)
+        self._to_line = self.normal.conj()
+        self._offset = np.append((lines.start * self._to_line[:-1]).real, _NOWHERE)
         self._colours = tuple(dict.fromkeys(lines.colour))
         ends = np.stack([lines.start, lines.start + lines.length * lines.direction])
         low = complex(ends.real.min(), ends.imag.min()) - (1.0 + 1.0j) * _NEAR
@@ -75,7 +77,7 @@ class NearestLines:
                 values[1] = np.where(first, values[0], np.where(second, value, values[1]))
                 values[0] = np.where(first, value, values[0])
         nearest[1][distance[1] > distance[0] + math.sqrt(2.0) * cell] = len(lines.length)
-        self._nearest, self._next = nearest.reshape(2, -1)
+        self._nearest = nearest.reshape(2, -1)
 
     def layers(self, colours: tuple[str, ...]) -> NDArray[np.intp]:
         """The layer of each of some colours, for :meth:`at`.
@@ -87,18 +89,21 @@ class NearestLines:
     def at(self, points: Complex, layer: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
         """Which line is nearest to each of points (H, P), and how far to its left it lies, metres.
 
-        Without a line near it has the number of lines and lies infinitely far off.
+        Without a line near it has the number of lines and lies farther off than any is.
 
         :param layer: of each point (P,).
         """
         place = ((points - self._origin) * self._scale).view(np.float64)
-        cell = np.minimum(np.maximum(place.reshape(*points.shape, 2), 0.0), self._last).astype(
-            np.intp)
-        index = cell[..., 1] * self._columns + cell[..., 0] + layer
-        first, second = self._nearest.take(index), self._next.take(index)
-        across, other = (self._across(points, which) for which in (first, second))
-        closer = np.abs(other) < np.abs(across)
-        return np.where(closer, second, first), np.where(closer, other, across)
-
-    def _across(self, points: Complex, which: NDArray[np.intp]) -> Array:
-        return (points * self.normal.take(which).conj()).real - self._offset.take(which)
+        place = place.reshape(*points.shape, 2)
+        np.maximum(place, 0.0, out=place)
+        np.minimum(place, self._last, out=place)
+        cell = place.astype(np.intp)
+        index = cell[..., 1] * self._columns
+        index += cell[..., 0]
+        index += layer
+        which = self._nearest.take(index, axis=1)
+        across = (points * self._to_line.take(which)).real
+        across -= self._offset.take(which)
+        far = np.abs(across)
+        closer = far[1] < far[0]
+        return np.where(closer, which[1], which[0]), np.where(closer, across[1], across[0])

@@ -21,8 +21,10 @@ from itertools import permutations
 import math
 
 from nccs_pose.estimation.association import Associator, FittedCandidate
+from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
@@ -66,7 +68,6 @@ class Searcher:
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
-        self._table = table
         self._associator = Associator(line_map, table)
         self._options = options
         self._widths: dict[str, float] = {}
@@ -79,6 +80,7 @@ class Searcher:
         while not by_hsv and table.rig.camera.width >= 2 * pitch * _WIDTH:
             pitch *= 2
         self._view = ReducedView.of(table.region, pitch)
+        self._floor = PixelFloor(self._view.pixels, pitch, table)
         # Things as wide are what a pixel of the view is compared with, px of the view.
         self._window = max(_LEAST_WINDOW, options.window // pitch)
         self.first: Look = self._first_look
@@ -159,12 +161,14 @@ class Searcher:
         for colour, mask in masks.items():
             blobs = self._view.blobs(mask, _PIXELS_PER_BLOB)
             found.extend(floor_segments(
-                blobs, self._table, self._widths[colour], colour, longest=self._longest))
+                blobs, self._floor, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(self, segments: Strips) -> tuple[FittedCandidate, ...]:
-        """Poses that explain the strips, best first."""
-        return self._associator.candidates(segments)
+    def candidates(
+        self, segments: Strips, told: Told | None = None,
+    ) -> tuple[FittedCandidate, ...]:
+        """Poses that explain the strips, best first; of too many those where it is told."""
+        return self._associator.candidates(segments, told)
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

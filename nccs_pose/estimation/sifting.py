@@ -21,14 +21,14 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
-from nccs_pose.estimation.association import same_pose
+from nccs_pose.estimation.association import FittedCandidate, same_pose
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
+from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -43,6 +43,10 @@ _WORTH_TRYING = 0.6
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
+# Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
+_AS_LAID = (0.03, 0.01)
+# A pose that explains this part of the strips leaves none unexplained.
+_ALL_STRIPS = 0.95
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 
@@ -77,21 +81,35 @@ class _Start:
     """A pose to lay on an image.
 
     :ivar reach: how far it may be off in the image, px.
-    :ivar score: of the strips, 0 to 1; None if it has to be tried in any case.
-    :ivar misfit: how far the strips lie off its lines, px.
+    :ivar strips: what they say of it; None if it has to be tried in any case.
     """
 
     pose: Pose2
     reach: float
-    score: float | None = None
-    misfit: float = 0.0
+    strips: FittedCandidate | None = None
+
+    @classmethod
+    def of(cls, candidate: FittedCandidate) -> _Start:
+        """From what the strips say."""
+        return cls(candidate.pose, _SEARCH_BAND, candidate)
+
+    @property
+    def misfit(self) -> float:
+        """How far the strips lie off its lines, px."""
+        return 0.0 if self.strips is None else self.strips.misfit
+
+    def kept(self, pose: Pose2) -> FittedCandidate | None:
+        """What the strips say of the pose that it became on the image; None where that is new."""
+        moved = np.abs(pose.minus(self.pose))
+        near = max(moved[0], moved[1]) < _AS_LAID[0] and moved[2] < _AS_LAID[1]
+        return self.strips if near else None
 
 
 class Sifter:
     """Lays poses on images of one rig and map."""
 
     def __init__(
-        self, aligner: Aligner, judge: Judge, searcher: Searcher, symmetries: tuple[Pose2, ...],
+        self, aligner: Aligner, judge: Judge, symmetries: tuple[Pose2, ...],
         options: LocaliserOptions,
     ) -> None:
         """Prepare.
@@ -100,58 +118,59 @@ class Sifter:
         """
         self._aligner = aligner
         self._judge = judge
-        self._searcher = searcher
         self._symmetries = symmetries
         self._options = options
 
     def sift(
         self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
-        prediction: Prediction | None, *, told: bool,
+        prediction: Prediction | None, told: Told | None,
     ) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image.
 
         :param doubts: lines that were seen beside their place and not in it since.
-        :param told: whether something else than the image can decide between equal poses. If not,
-            two are enough to know that it does not.
+        :param told: where the robot is by something else than the image, which can decide between
+            equal poses: those that are there come first. Without it two equal poses are enough to
+            know that the image does not decide, and of the others only hypotheses are laid on it.
         """
         options = self._options
+        candidates = sight.candidates
+        if told is not None and len(candidates) > _TRIED:
+            candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
         starts = [_Start(h.pose, options.band) for h in hypotheses]
-        starts += [
-            _Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[:_TRIED]
-            if c.score >= _WORTH_TRYING * sight.promise]
-        left = [_Start(c.pose, _SEARCH_BAND, c.score, c.misfit) for c in sight.candidates[_TRIED:]]
+        starts += [_Start.of(c) for c in candidates[:_TRIED]
+                   if c.score >= _WORTH_TRYING * sight.promise]
+        left = [_Start.of(c) for c in candidates[_TRIED:]]
         sifted = Sifted([], [], [], [])
         doubtful: list[Found] = []
         seen: list[Pose2] = []
         best: tuple[_Start, Found] | None = None
-        # What holds adds its twins to the end of the queue.
         for start in starts:
             if best is not None and not self._rivals(start, *best):
                 continue
             if any(same_pose(start.pose, pose) for pose in seen):
                 continue
-            if not told and len(self._equals(sifted.held)) > 1:
+            if told is None and start.strips is not None and len(
+                    self._equals(sifted.held)) > 1:
                 left.append(start)
                 continue
-            alignment = self._laid(sight, start)
-            if alignment is None or any(same_pose(alignment.pose, pose) for pose in seen):
+            verdict = self._verdict(sight, start, doubts, prediction, seen)
+            if verdict is None:
                 continue
+            alignment, found = verdict
             seen.append(alignment.pose)
-            expected = is_expected(alignment, prediction, options.innovation_gate)
-            found = self._judge.found(
-                sight.image, alignment, sight.segments, doubts, expected=expected)
-            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
-                doubtful.append(found)
-                sifted.refused.append(Refused(_DOUBTFUL, alignment))
-                continue
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
-                if found.hidden:
-                    score, _ = self._searcher.score(alignment.pose, sight.segments)
-                    sifted.hidden.append(Candidate(alignment.pose, score))
+                if found is _DOUBTFUL:
+                    doubtful.append(self._measured(sight, start, alignment))
+                elif found.hidden:
+                    shown = self._measured(sight, start, alignment)
+                    sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
                 continue
             sifted.held.append(found)
-            starts += [_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries]
+            # On the image the twins of what holds are what it is itself.
+            for twin in (_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries):
+                there = told is not None and told.holds(twin.pose)
+                (starts if there else left).append(twin)
             if best is None or found.score > best[1].score:
                 best = start, found
         sifted.held.sort(key=lambda f: -f.score)
@@ -181,22 +200,53 @@ class Sifter:
                 sifted.open.append(Candidate(pose, min(found.score, best.score)))
             else:
                 sifted.hidden.append(Candidate(pose, found.by_strips))
-        seen = list(seen)
-        for start in left:
-            share = 1.0 if start.score is None else min(start.score / best.by_strips, 1.0)
-            if share >= ratio and not any(same_pose(start.pose, pose) for pose in seen):
-                seen.append(start.pose)
-                sifted.open.append(Candidate(start.pose, share * best.score))
+        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
+        twins, seen = [found.alignment.pose for found in sifted.held], list(seen)
+        for start in (start for start in left if start.strips is None):
+            if not any(same_pose(start.pose, pose) for pose in twins):
+                twins.append(start.pose)
+                sifted.open.append(Candidate(start.pose, best.score))
+        seen += twins
+        # Candidates differ among themselves.
+        for strips in (start.strips for start in left if start.strips is not None):
+            share = min(strips.score / best.by_strips, 1.0)
+            if share >= ratio and not any(same_pose(strips.pose, pose) for pose in seen):
+                sifted.open.append(Candidate(strips.pose, share * best.score))
+        sifted.open.sort(key=lambda candidate: -candidate.score)
 
-    def _laid(self, sight: Sight, start: _Start) -> Alignment | None:
-        """Lay a pose on the image: by searching its surroundings only where a line is left out."""
-        if start.misfit < LINEAR_PX:
+    def _verdict(
+        self, sight: Sight, start: _Start, doubts: Set[int], prediction: Prediction | None,
+        seen: list[Pose2],
+    ) -> tuple[Alignment, Found | Objection] | None:
+        """Lay a pose on the image, and judge it; None where it does not lie, or was seen before.
+
+        Its surroundings are searched only where it does not fit, or where a line that it misses
+        may be there.
+        """
+        verdict = None
+        for reach in (LINEAR_PX, start.reach):
+            if reach == LINEAR_PX and start.misfit >= LINEAR_PX:
+                continue
             alignment = self._aligner.align(
-                sight.image, start.pose, sight.colours, reach=LINEAR_PX)
-            if alignment is not None and not alignment.missing:
-                return alignment
-        return self._aligner.align(
-            sight.image, start.pose, sight.colours, reach=start.reach)
+                sight.image, start.pose, sight.colours, reach=reach)
+            if alignment is None:
+                continue
+            if any(same_pose(alignment.pose, pose) for pose in seen):
+                return verdict
+            expected = is_expected(alignment, prediction, self._options.innovation_gate)
+            found = self._judge.found(
+                sight.image, alignment, sight.segments, doubts, expected=expected,
+                strips=start.kept(alignment.pose))
+            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
+                found = _DOUBTFUL
+            verdict = alignment, found
+            if isinstance(found, Found) or not alignment.missing:
+                break
+        return verdict
+
+    def _measured(self, sight: Sight, start: _Start, alignment: Alignment) -> Found:
+        """How much a pose explains that was refused."""
+        return self._judge.measured(alignment, sight.segments, start.kept(alignment.pose))
 
     def _doubtful(self, found: Found, sight: Sight) -> bool:
         """Whether the strips speak as much for another pose, and the image for neither.
@@ -217,12 +267,14 @@ class Sifter:
 
         No pose scores more on the image than the root of what it scores on the strips, times
         what is left of that by how far they lie off its lines; and where the strips show all that
-        the pose that holds expects, and nothing else, they tell rivals as well as the image.
+        the pose that holds expects, and nothing else, they tell rivals as well as the image: but
+        for one that leaves no strip unexplained, of which more may be there than the strips show.
         """
-        if start.score is None:
+        if start.strips is None:
             return True
-        ratio = self._options.ambiguity_ratio
-        if explains_nearly_all(held) and start.score < ratio * held.by_strips:
+        ratio, score = self._options.ambiguity_ratio, start.strips.score
+        if explains_nearly_all(held) and score < ratio * held.by_strips and (
+                start.strips.claimed < _ALL_STRIPS):
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
-        return math.sqrt(start.score) * fit_of(excess) >= ratio * held.score
+        return math.sqrt(score) * fit_of(excess) >= ratio * held.score

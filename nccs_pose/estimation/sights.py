@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.told import Told
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,11 @@ from numpy.typing import NDArray
 # the next scores less than this part of it.
 _PLAIN = 0.8
 _RIVAL = 0.8
+# A place is one of many when more poses than this score so and leave next to nothing unexplained
+# of so many strips.
+_MANY = 6
+_ALL = 0.95
+_LEAST_STRIPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +65,28 @@ class Sight:
         return self.promise > _PLAIN or (
             self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise)
 
+    @property
+    def is_repeated(self) -> bool:
+        """Whether many places show all that is seen here: more of it would tell none of them."""
+        equal = [c for c in self.candidates
+                 if c.claimed > _ALL and c.score > _RIVAL * self.promise]
+        return len(equal) > _MANY and len(self.segments) >= _LEAST_STRIPS
+
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
-    lap: Callable[[str], None],
+    told: Told | None, lap: Callable[[str], None],
 ) -> Iterator[Sight]:
-    """What is worth a try: every look that is promising, and at last the best if none was.
+    """What is worth a try: every look that is promising or, if none is, the best.
+
+    So is one at which many places look the same: it may show at once that it decides nothing, but
+    is tried again at last if it seemed to decide.
 
     What is given is to be tried before the next is asked for.
 
     :param in_vain: how many images before this one were searched and showed nothing; then the
         further looks take turns from image to image.
+    :param told: where the robot is by something else than the image.
     :param lap: is told the name of each stage that ends.
     """
     groups = searcher.further
@@ -82,7 +99,7 @@ def sights(
         if best is not None and segments is best.segments:
             continue
         lap('detect')
-        sight = Sight(image, segments, searcher.candidates(segments), shown)
+        sight = Sight(image, segments, searcher.candidates(segments, told), shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
@@ -91,6 +108,7 @@ def sights(
             sight = best = replace(best, colours=shown)
         if sight.is_promising:
             tried.append(sight)
+        if sight.is_promising or sight.is_repeated:
             yield sight
         if len(tried) > 1 and best.promise > _PLAIN:
             return

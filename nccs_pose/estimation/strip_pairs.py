@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import combinations
 import math
 
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -28,6 +27,8 @@ from numpy.typing import NDArray
 
 # A map of many equal places gives no end of hypotheses: those of the heaviest strips are enough.
 _ENOUGH = 1500
+# A strip with each of those that are heavier, and then the next; no image has more of them.
+_BY_WEIGHT = np.tril_indices(128, -1)
 # Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
 _CROSSING = 0.12
 _ANGLE_GATE = 0.07
@@ -91,28 +92,30 @@ def poses_of_pairs(
     """Poses that lay a pair of strips on a pair of map lines, those of the heaviest strips first.
 
     :param strips: the heaviest first.
-    :param most: only so many of them are laid.
+    :param most: only so many pairs that cross are laid.
     :returns: the poses' rotations, unit (H,), and places (H,).
     """
     a, b, turn = lines.crossings
-    first, second = np.array(list(combinations(range(min(most, len(strips.length))), 2))).T
+    count = len(strips.length)
+    second, first = (side[:count * (count - 1) // 2] for side in _BY_WEIGHT)
     between = strips.direction[second] * strips.direction[first].conj()
+    cross = np.flatnonzero(np.abs(between.imag) >= math.sin(_CROSSING))[:most]
+    first, second, between = first[cross], second[cross], between[cross]
     match = np.abs((turn * between.conj()[:, None]).imag) < math.sin(_ANGLE_GATE)
-    match &= (np.abs(between.imag) >= math.sin(_CROSSING))[:, None]
     fits = strips.fits(lines)
     match &= fits[first][:, a] & fits[second][:, b]
     pair, crossing = np.nonzero(match)
     if len(pair) == 0:
         return np.zeros(0, complex), np.zeros(0, complex)
-    found, count = [], 0
+    found, laid = [], 0
     # Whole pairs of strips: any of them may be the one that is not what it seems.
-    starts = np.flatnonzero(np.diff(pair, prepend=-1))
-    cuts = starts[1:] if len(pair) > _ENOUGH else starts[:0]
+    ends = np.flatnonzero(pair[1:] > pair[:-1]) + 1
+    cuts = ends if len(pair) > _ENOUGH else ends[:0]
     for part in np.split(np.arange(len(pair)), cuts):
         one, other = first[pair[part]], second[pair[part]]
         found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))
-        count += len(found[-1][0])
-        if count > _ENOUGH:
+        laid += len(found[-1][0])
+        if laid > _ENOUGH:
             break
     rotations, places = (np.concatenate(parts) for parts in zip(*found))
     return rotations, places
@@ -129,17 +132,16 @@ def _laid(
     # Strips and lines go either way: half a turn between both does not count.
     rotation = by_first + np.copysign(1.0, (by_second * by_first.conj()).real) * by_second
     rotation /= np.abs(rotation)
-    # Either way round.
-    rotation = np.concatenate([rotation, -rotation])
-    strip, direction, line = np.tile(strip, 2), np.tile(direction, 2), np.tile(line, 2)
-    # Each middle in its line's own frame, along + i across, but for the place.
+    # Either way round (2, 1, K).
+    rotation = np.array([rotation, -rotation])[:, None]
+    # Each middle in its line's own frame, along + i across, but for the place (2, 2, K).
     middle = (rotation * strips.middle[strip] - lines.start[line]) * direction.conj()
     off = middle.imag / (direction[1] * direction[0].conj()).imag
-    place = off[1] * direction[0] - off[0] * direction[1]
+    place = off[:, 1:] * direction[0] - off[:, :1] * direction[1]
     along = middle.real + (place * direction.conj()).real
     half = 0.5 * strips.length[strip]
     outside = (np.maximum(half - along, 0.0)
                + np.maximum(along + half - lines.length[line], 0.0))
     # Something in line with a tape may have been joined to it.
-    good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=0)
-    return rotation[good], place[good]
+    good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=1)
+    return rotation[:, 0][good], place[:, 0][good]

@@ -65,6 +65,19 @@ def solved(matrix: Array, right: Array) -> Array | None:
     return None if found is None else np.array(found)
 
 
+def definite_solutions(matrices: Array, right: Array) -> Array:
+    """Solutions (H, 3) of systems (H, 3, 3) that are positive definite, far beyond rounding."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrices.transpose(1, 2, 0)
+    gx, gy, gz = right.T
+    one, other, first = xy / xx, xz / xx, gx / xx
+    a, b, c = yy - one * xy, yz - one * xz, zz - other * xz
+    second, last = (gy - one * gx) / a, gz - other * gx
+    share = b / a
+    z = (last - b * second) / (c - share * b)
+    y = second - share * z
+    return np.stack([first - one * y - other * z, y, z], axis=1)
+
+
 def solution(matrix: Array, right: Array) -> Array:
     """Solution (P,) of any regular, symmetric system (P, P)."""
     found = solved(matrix, right) if len(right) == 3 else None

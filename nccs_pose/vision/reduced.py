@@ -21,7 +21,7 @@ cost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 from nccs_pose.geometry.pose import Array
@@ -60,9 +60,16 @@ class ReducedView:
 
     def blobs(self, mask: Mask, pixels_per_blob: int) -> Segmentation:
         """Blobs of a mask (h, w) of the view where it shows floor, in pixels of the image."""
-        found = find_blobs(
-            cv2.bitwise_and(mask, self.region), pixels_per_blob, pitch=self.pitch)
-        return replace(found, pixels=found.pixels + self._origin)
+        return find_blobs(
+            cv2.bitwise_and(mask, self.region), pixels_per_blob, pitch=self.pitch,
+            origin=(self.columns.start, self.rows.start))
+
+    @property
+    def pixels(self) -> Array:
+        """The middles of the view's pixels, row by row (h * w, 2), in the image."""
+        row, column = np.indices(self.region.shape).reshape(2, -1)
+        return self.pitch * np.column_stack([column, row]) + (
+            self._origin + 0.5 * (self.pitch - 1))
 
     def places(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns (N,) of the view that hold pixels (N, 2) of the image, or are next."""

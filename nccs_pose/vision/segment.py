@@ -52,6 +52,7 @@ class Segmentation:
 
     :ivar mask: (H, W) uint8, 255 where it has.
     :ivar pixels: pixels (P, 2) of the blobs, u and v, at most a fixed number of each blob.
+    :ivar place: of each in the mask, row by row (P,).
     :ivar label: blob of each (P,).
     :ivar weight: how many pixels of its blob each stands for (P,).
     :ivar pitch: side of what was one pixel when the blobs were found, px.
@@ -59,6 +60,7 @@ class Segmentation:
 
     mask: Mask
     pixels: Array
+    place: NDArray[np.intp]
     label: NDArray[np.intp]
     weight: Array
     pitch: int = 1
@@ -147,7 +149,9 @@ def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
     return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), low, high)
 
 
-def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentation:
+def find_blobs(
+    mask: Mask, pixels_per_blob: int, *, pitch: int = 1, origin: tuple[int, int] = (0, 0),
+) -> Segmentation:
     """Close small gaps and collect what lies within the contours of a mask.
 
     Tapes may be a pixel wide, so nothing is ever eroded.
@@ -155,6 +159,7 @@ def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentat
     :param mask: (H, W) uint8, 255 inside.
     :param pitch: the mask is of an image so many times smaller; pixels and weights are given in
         those of the image itself.
+    :param origin: column and row of the image where the mask begins.
     """
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -174,7 +179,11 @@ def find_blobs(mask: Mask, pixels_per_blob: int, *, pitch: int = 1) -> Segmentat
     stride = np.maximum(1, size // pixels_per_blob)
     first = np.cumsum(size) - size
     chosen = np.flatnonzero((np.arange(len(blob)) - first[blob]) % stride[blob] == 0)
-    row, column = np.divmod(place[order[chosen]], mask.shape[1])
+    place, label = place[order[chosen]], blob[chosen]
+    row, column = np.divmod(place, mask.shape[1])
+    middle, pixels = 0.5 * (pitch - 1), np.empty((len(place), 2))
+    pixels[:, 0] = pitch * column + (origin[0] + middle)
+    pixels[:, 1] = pitch * row + (origin[1] + middle)
     return Segmentation(
-        closed, pitch * np.column_stack([column, row]) + 0.5 * (pitch - 1), blob[chosen],
-        stride[blob[chosen]] * float(pitch * pitch), pitch)
+        closed, pixels, place, label,
+        stride[label] * float(pitch * pitch), pitch)

@@ -1,0 +1,60 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where the robot is by something else than the image; it decides between equal poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.geometry.floor_table import Complex
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.small_matrices import inverse
+import numpy as np
+from numpy.typing import NDArray
+
+# So well (m, m and rad, deviations) strips alone tell a pose.
+_GUESSED = np.diag([0.05, 0.05, 0.02])**2
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """A place that a prior or a prediction tells.
+
+    :ivar pose: T_map_base.
+    :ivar covariance: of (x, y, yaw) (3, 3).
+    :ivar gate: how many deviations the robot may be off it.
+    """
+
+    pose: Pose2
+    covariance: Array
+    gate: float
+
+    def holds(self, pose: Pose2, covariance: Array = _GUESSED) -> bool:
+        """Whether a pose is there, as sure as its own covariance; that of a guess by strips."""
+        return bool(self._holds(pose.minus(self.pose)[:, None], covariance)[0])
+
+    def holds_guesses(self, places: Complex, rotations: Complex) -> NDArray[np.bool_]:
+        """Whether poses that strips tell are there (H,).
+
+        :param places: x + iy (H,), metres.
+        :param rotations: unit complex numbers (H,).
+        """
+        off = places - complex(self.pose.x, self.pose.y)
+        return self._holds(np.array([
+            off.real, off.imag, np.angle(rotations * np.exp(-1j * self.pose.yaw))]), _GUESSED)
+
+    def _holds(self, off: Array, covariance: Array) -> NDArray[np.bool_]:
+        information = inverse(self.covariance + covariance)
+        return np.einsum('ih,ij,jh->h', off, information, off) <= self.gate**2
