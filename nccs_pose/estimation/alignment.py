@@ -46,10 +46,10 @@ _SEARCHED_SPACING = 8.0
 # A profile is linear in its shift for about so many pixels.
 LINEAR_PX = 2.0
 _ITERATIONS = 8
-# The poses have settled when the last step moved no station by more than this share of the blur (a
-# shift so small is measured right to two hundredths), or when it was below half a standard
-# deviation.
-_SETTLED_BLURS = 0.3
+# The poses have settled when the last step moved no station by more than this share of the blur
+# (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
+# half a standard deviation), or when it was below half a standard deviation.
+_SETTLED_BLURS = 0.1
 _SETTLED = 0.5
 # Nor does a pass count that has just learned a blur so different, px: a template too soft or too
 # sharp takes a step for larger or smaller than it is.

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-import time
 
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.alignment import Aligner, Alignment
@@ -34,7 +33,6 @@ from nccs_pose.estimation.estimate import (
     Doubted,
     Estimate,
     Quality,
-    StageTimes,
     State,
 )
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -59,8 +57,14 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sifting import Refused, Sifter
 from nccs_pose.estimation.sights import sights
+from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.told import Told
-from nccs_pose.estimation.verdict import contradiction, lines_used, Objection
+from nccs_pose.estimation.verdict import (
+    contradiction,
+    lines_used,
+    Objection,
+    what_is_missing,
+)
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -81,23 +85,6 @@ _FOREIGN = 0.25
 _CARRIED = 8
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
-
-
-class _Stopwatch:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self._seconds: dict[str, float] = {}
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
-        self._last = now
-
-    @property
-    def times(self) -> StageTimes:
-        return StageTimes(**self._seconds)
 
 
 class Localiser:
@@ -188,7 +175,7 @@ class Localiser:
         if not self._admission.admit(stamp_ns, image):
             self._odometry.clear()
             self.relocalise()
-        watch = _Stopwatch()
+        watch = Stopwatch()
         self._now = self._odometry.at(stamp_ns)
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
@@ -210,7 +197,7 @@ class Localiser:
         return by_velocity(before, track, stamp_ns)
 
     def _follow(
-        self, image: NDArray[np.uint8], prediction: Prediction, watch: _Stopwatch,
+        self, image: NDArray[np.uint8], prediction: Prediction, watch: Stopwatch,
     ) -> Found | Refused:
         """Lay the predicted pose on the image; refused where the whole must be searched."""
         prior = (prediction.pose, prediction.covariance)
@@ -251,7 +238,7 @@ class Localiser:
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
-        refused: Refused, watch: _Stopwatch,
+        refused: Refused, watch: Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         hypotheses = carried(self._open, self._open_odometry, self._now)
@@ -306,7 +293,7 @@ class Localiser:
         return self._undecided(stamp_ns, held, more, watch)
 
     def _trusted(
-        self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: _Stopwatch,
+        self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: Stopwatch,
     ) -> tuple[Found, Prediction] | None:
         """The pose that was given, where too little is in view to find it without."""
         if self._prior is None:
@@ -348,7 +335,7 @@ class Localiser:
         return best
 
     def _tracking(
-        self, stamp_ns: int, found: Found, prior: Prediction | None, watch: _Stopwatch,
+        self, stamp_ns: int, found: Found, prior: Prediction | None, watch: Stopwatch,
         reason: str, held: list[Found] | None = None,
     ) -> Estimate:
         """Take a pose over.
@@ -385,7 +372,7 @@ class Localiser:
             quality, watch.times)
 
     def _undecided(
-        self, stamp_ns: int, held: list[Found], more: list[Hypothesis], watch: _Stopwatch,
+        self, stamp_ns: int, held: list[Found], more: list[Hypothesis], watch: Stopwatch,
     ) -> Estimate:
         """Say which poses may be right, and give none of them.
 
@@ -408,11 +395,11 @@ class Localiser:
 
     def _without_pose(
         self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
-        refused: Refused, watch: _Stopwatch,
+        refused: Refused, watch: Stopwatch,
     ) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
         against, doubted, track = refused.objection, None, self._track
-        missing = against.words if against is not None else _what_is_missing(segments)
+        missing = against.words if against is not None else what_is_missing(segments)
         # A line beside its place for the second time, or one that no pose has rested on, speaks
         # against the poses before as well.
         contradicted = False
@@ -452,15 +439,3 @@ def _quality(found: Found, ambiguity: float, unobserved: Sequence[Unobserved] = 
         residual_px=alignment.residual_px, expected_px=alignment.expected_px,
         explained=alignment.explained, claimed=found.claimed, ambiguity=ambiguity,
         unobserved=tuple(u.words for u in unobserved))
-
-
-def _what_is_missing(segments: tuple[FloorSegment, ...]) -> str:
-    """Why an image gives no pose, in words."""
-    if not segments:
-        return 'no line-like strip in the image'
-    if len(segments) == 1:
-        return 'only one line-like strip in the image'
-    angles = np.array([np.arctan2(s.normal[1], s.normal[0]) for s in segments])
-    if (np.abs(np.sin(angles - angles[0])) < 0.12).all():
-        return f'all {len(segments)} line-like strips in the image are parallel'
-    return f'no pose explains the {len(segments)} line-like strips in the image'

@@ -27,9 +27,10 @@ import numpy as np
 
 # A pose rests on a line when it does on this part of the line's stations.
 _RESTS = 0.25
-# A strip this near a missing line (m) and this parallel to it (rad) is that line, moved.
-_NEAR = 0.6
+# Strips this parallel (rad) count as parallel; one so parallel to a missing line and this near
+# (m) is that line, moved.
 _PARALLEL = 0.12
+_NEAR = 0.6
 # A strip closer than this to a map line lies on it, metres beyond its own footprint.
 _ON = 0.06
 # A whole line lies off its place when its mean is this many standard deviations from zero: what
@@ -170,3 +171,15 @@ def _lies_on_map(strip: FloorSegment, pose: Pose2, line_map: LineMap) -> bool:
                 and along.min() < line.length):
             return True
     return False
+
+
+def what_is_missing(segments: tuple[FloorSegment, ...]) -> str:
+    """Why strips give no pose, in words."""
+    if not segments:
+        return 'no line-like strip in the image'
+    if len(segments) == 1:
+        return 'only one line-like strip in the image'
+    angles = np.array([np.arctan2(s.normal[1], s.normal[0]) for s in segments])
+    if (np.abs(np.sin(angles - angles[0])) < _PARALLEL).all():
+        return f'all {len(segments)} line-like strips in the image are parallel'
+    return f'no pose explains the {len(segments)} line-like strips in the image'
