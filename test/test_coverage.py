@@ -12,7 +12,6 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """The trials by which covariances are judged."""
 
 from __future__ import annotations

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from nccs_pose.estimation.common_errors import common_misfit, root_mean_square
 from nccs_pose.estimation.options import LocaliserOptions
@@ -80,9 +81,6 @@ class Alignment:
     :ivar points: the pixels it rests on, labelled by map line.
     :ivar residual: of the points, whitened (N,).
     :ivar noise: of the image, by which they are whitened (N,), px.
-    :ivar scale: root mean square residual, as a multiple of the noise.
-    :ivar residual_px: the same in px.
-    :ivar expected_px: what the noise makes of it, px.
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
     :ivar missing: map lines that should be seen plainly and are not there.
@@ -98,15 +96,27 @@ class Alignment:
     points: LinePoints
     residual: Array
     noise: Array
-    scale: float
-    residual_px: float
-    expected_px: float
     explained: float
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
     misfit: float
     colours: tuple[LineColour, ...]
+
+    @cached_property
+    def scale(self) -> float:
+        """Root mean square residual, as a multiple of the noise."""
+        return root_mean_square(self.residual)
+
+    @cached_property
+    def residual_px(self) -> float:
+        """Root mean square residual, px."""
+        return root_mean_square(self.residual * self.noise)
+
+    @cached_property
+    def expected_px(self) -> float:
+        """What the noise makes of it, px."""
+        return root_mean_square(self.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,12 +305,10 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
     misfit = common_misfit(
         np.add.reduceat(residual, first) / np.sqrt(members), together, label.take(first))
-    scale = root_mean_square(residual)
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
-        LinePoints(pixels, scale * sigma, label), residual, sigma, scale,
-        root_mean_square(residual * sigma), root_mean_square(sigma),
+        LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(there.nonzero()[0].tolist()), _missing(bands, index),
         there / np.where(seen > 0, seen, np.nan), misfit, measured.colours)

@@ -27,7 +27,7 @@ from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.sights import Sight
+from nccs_pose.estimation.sights import ALL_STRIPS, Sight
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
@@ -45,8 +45,6 @@ _SHARP = 0.8
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
-# A pose that explains this part of the strips leaves none unexplained.
-_ALL_STRIPS = 0.95
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 
@@ -274,7 +272,7 @@ class Sifter:
             return True
         ratio, score = self._options.ambiguity_ratio, start.strips.score
         if explains_nearly_all(held) and score < ratio * held.by_strips and (
-                start.strips.claimed < _ALL_STRIPS):
+                start.strips.claimed < ALL_STRIPS):
             return False
         excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
         return math.sqrt(score) * fit_of(excess) >= ratio * held.score

@@ -31,10 +31,11 @@ from numpy.typing import NDArray
 # the next scores less than this part of it.
 _PLAIN = 0.8
 _RIVAL = 0.8
-# A place is one of many when more poses than this score so and leave next to nothing unexplained
-# of so many strips.
+# A pose that explains this part of the strips leaves none unexplained.
+ALL_STRIPS = 0.95
+# A place is one of many when more poses than this score so and leave none of so many strips
+# unexplained.
 _MANY = 6
-_ALL = 0.95
 _LEAST_STRIPS = 3
 
 
@@ -69,7 +70,7 @@ class Sight:
     def is_repeated(self) -> bool:
         """Whether many places show all that is seen here: more of it would tell none of them."""
         equal = [c for c in self.candidates
-                 if c.claimed > _ALL and c.score > _RIVAL * self.promise]
+                 if c.claimed > ALL_STRIPS and c.score > _RIVAL * self.promise]
         return len(equal) > _MANY and len(self.segments) >= _LEAST_STRIPS
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from nccs_pose.estimation.alignment import close
 from nccs_pose.geometry.floor_table import Complex
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import inverse
@@ -43,7 +44,7 @@ class Told:
 
     def holds(self, pose: Pose2, covariance: Array = _GUESSED) -> bool:
         """Whether a pose is there, as sure as its own covariance; that of a guess by strips."""
-        return bool(self._holds(pose.minus(self.pose)[:, None], covariance)[0])
+        return close(pose, self.pose, self.covariance + covariance, self.gate)
 
     def holds_guesses(self, places: Complex, rotations: Complex) -> NDArray[np.bool_]:
         """Whether poses that strips tell are there (H,).
@@ -52,9 +53,6 @@ class Told:
         :param rotations: unit complex numbers (H,).
         """
         off = places - complex(self.pose.x, self.pose.y)
-        return self._holds(np.array([
-            off.real, off.imag, np.angle(rotations * np.exp(-1j * self.pose.yaw))]), _GUESSED)
-
-    def _holds(self, off: Array, covariance: Array) -> NDArray[np.bool_]:
-        information = inverse(self.covariance + covariance)
+        off = np.array([off.real, off.imag, np.angle(rotations * np.exp(-1j * self.pose.yaw))])
+        information = inverse(self.covariance + _GUESSED)
         return np.einsum('ih,ij,jh->h', off, information, off) <= self.gate**2
