@@ -26,8 +26,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from nccs_pose.estimation.admission import Admission
-from nccs_pose.estimation.alignment import Aligner, Alignment
+from nccs_pose.estimation.alignment import Aligner
 from nccs_pose.estimation.association import map_symmetries, same_pose
+from nccs_pose.estimation.decision import left_open, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,
     Doubted,
@@ -36,21 +37,9 @@ from nccs_pose.estimation.estimate import (
     State,
 )
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.hypotheses import (
-    ambiguity,
-    carried,
-    confronted,
-    Hypothesis,
-    LEAST_IMAGES,
-)
-from nccs_pose.estimation.judge import (
-    Found,
-    is_expected,
-    Judge,
-    lines_shown,
-    OPEN,
-    settled_doubts,
-)
+from nccs_pose.estimation.following import Follower
+from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
+from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
@@ -59,12 +48,7 @@ from nccs_pose.estimation.sifting import Refused, Sifter
 from nccs_pose.estimation.sights import sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.told import Told
-from nccs_pose.estimation.verdict import (
-    contradiction,
-    lines_used,
-    Objection,
-    what_is_missing,
-)
+from nccs_pose.estimation.verdict import what_is_missing
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -74,15 +58,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DEFAULTS = LocaliserOptions()
-# A pose elsewhere must beat the tracked one by this much to unseat it.
-_BETTER = 0.15
 # Odometry carries a pose on only while it explains this part of what looks like a line, if that is
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
 _FOREIGN = 0.25
-# Of the poses among which an image does not decide so many are laid on the next; on a map with
-# many places alike its own search finds the others again.
-_CARRIED = 8
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
 
@@ -112,16 +91,18 @@ class Localiser:
         A new reach needs new tables and is taken over by a new localiser only.
         """
         self.options = options
-        self._aligner = Aligner(self._table, self._map, options)
+        aligner = Aligner(self._table, self._map, options)
+        self._nominal_colours = aligner.nominal_colours
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
-        self._sifter = Sifter(self._aligner, self._judge, self._symmetries, options)
+        self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
+        self._sifter = Sifter(aligner, self._judge, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""
         self._odometry.clear()
         self._admission.forget()
-        self._colours = self._aligner.nominal_colours
+        self._colours = self._nominal_colours
         self.relocalise()
 
     def relocalise(self) -> None:
@@ -133,7 +114,7 @@ class Localiser:
         self._before: Track | None = None
         self._prior: tuple[Pose2, Array] | None = None
         self._ever_tracked = False
-        self._frames_since_check = 0
+        self._follower.begin()
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -150,7 +131,7 @@ class Localiser:
         """The colours before any image of this place, as blurred as the last image was."""
         return tuple(
             replace(colour, blur=known.blur)
-            for colour, known in zip(self._aligner.nominal_colours, self._colours))
+            for colour, known in zip(self._nominal_colours, self._colours))
 
     def set_prior(self, pose: Pose2, covariance: Array) -> None:
         """Give a hypothesis, as by hand or from the last run: it decides between equal poses.
@@ -181,7 +162,8 @@ class Localiser:
         watch.lap('predict')
         refused = Refused()
         if prediction is not None:
-            followed = self._follow(image, prediction, watch)
+            followed = self._follower.follow(
+                image, prediction, self._colours, self._doubts, watch)
             if isinstance(followed, Found):
                 return self._tracking(
                     stamp_ns, followed, prediction, watch, 'the pose explains the image')
@@ -195,46 +177,6 @@ class Localiser:
         if track.odometry is not None and self._now is not None:
             return by_odometry(track.pose, track.covariance, track.odometry, self._now)
         return by_velocity(before, track, stamp_ns)
-
-    def _follow(
-        self, image: NDArray[np.uint8], prediction: Prediction, watch: Stopwatch,
-    ) -> Found | Refused:
-        """Lay the predicted pose on the image; refused where the whole must be searched."""
-        prior = (prediction.pose, prediction.covariance)
-        refused = Refused()
-        for reach in (0.0, self.options.band):
-            alignment = self._aligner.align(
-                image, prediction.pose, self._colours, reach=reach, prior=prior)
-            watch.lap('measure')
-            if alignment is None or not self._expected(alignment, prediction):
-                continue
-            against = self._judge.objection(image, alignment, self._doubts, expected=True)
-            if against is None:
-                break
-            refused = Refused(against, alignment)
-        else:
-            return refused
-        self._frames_since_check += 1
-        due = self._frames_since_check >= self.options.check_every
-        if not (due or alignment.missing or len(alignment.lines) == 1):
-            return Found(alignment, float('nan'), alignment.explained)
-        self._frames_since_check = 0
-        segments = self._searcher.segments(image)
-        watch.lap('detect')
-        against = contradiction(alignment, segments, self._map)
-        if against is not None:
-            return Refused(against, alignment)
-        here, claimed = self._searcher.score(alignment.pose, segments)
-        # No score exceeds 1.
-        elsewhere = self._searcher.candidates(segments) if here + _BETTER < 1.0 else ()
-        watch.lap('associate')
-        if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
-                elsewhere[0].pose, alignment.pose):
-            return Refused(Objection('another pose explains the image better'), alignment)
-        return Found(alignment, claimed, alignment.explained)
-
-    def _expected(self, alignment: Alignment, prediction: Prediction | None) -> bool:
-        return is_expected(alignment, prediction, self.options.innovation_gate)
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
@@ -269,23 +211,17 @@ class Localiser:
             if refused.objection is None and refusals:
                 refused = refusals[0]
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = self._decide(held, sifted.open, prediction, told)
+        chosen = the_one_expected(held, sifted.open, told, prediction, self.options)
         if chosen is not None:
             words = 'found by searching the whole image'
             if len(held) > 1:
                 words = 'several poses explain the image; the one expected was taken'
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
-        hypotheses = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
-        others = sorted(
-            (*hypotheses[1:], *(Hypothesis(c.pose, (c.score,)) for c in sifted.open)),
-            key=lambda h: -h.mean)
-        hypotheses, more = (hypotheses[0], *others[:_CARRIED - 1]), others[_CARRIED - 1:]
-        if lines_used(held[0].alignment) < 3:
-            hypotheses += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-        self._open, self._open_odometry = hypotheses, self._now
-        best = hypotheses[0]
-        if ambiguity(hypotheses) <= self.options.ambiguity_ratio and (
+        self._open, more = left_open(hypotheses, held, sifted)
+        self._open_odometry = self._now
+        best = self._open[0]
+        if ambiguity(self._open) <= self.options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
@@ -299,7 +235,7 @@ class Localiser:
         if self._prior is None:
             return None
         given = Prediction(*self._prior, by_odometry=False)
-        followed = self._follow(image, given, watch)
+        followed = self._follower.follow(image, given, self._colours, self._doubts, watch)
         if not isinstance(followed, Found):
             return None
         _, claimed = self._searcher.score(followed.alignment.pose, segments)
@@ -312,27 +248,6 @@ class Localiser:
         if prediction is not None:
             return Told(prediction.pose, prediction.covariance, self.options.innovation_gate)
         return None
-
-    def _decide(
-        self, held: list[Found], left: list[Candidate], prediction: Prediction | None,
-        told: Told | None,
-    ) -> Found | None:
-        """The one pose that a prior or the prediction expects, if it is one of the best of all.
-
-        :param left: poses that may explain the image as well, but were not laid on it.
-        """
-        if told is None:
-            return None
-        near = [f for f in held if (
-            told.holds(f.alignment.pose, f.alignment.covariance) if self._prior is not None
-            else self._expected(f.alignment, prediction))]
-        if not near or any(told.holds(c.pose) for c in left):
-            return None
-        best, ratio = near[0], self.options.ambiguity_ratio
-        if best.score < ratio * held[0].score or any(
-                f.score >= ratio * best.score for f in near[1:]):
-            return None
-        return best
 
     def _tracking(
         self, stamp_ns: int, found: Found, prior: Prediction | None, watch: Stopwatch,

@@ -1,0 +1,75 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which of the poses that explain an image is the right one, if that can be said."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.hypotheses import confronted, Hypothesis
+from nccs_pose.estimation.judge import Found, is_expected
+from nccs_pose.estimation.motion import Prediction
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.sifting import Sifted
+from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.verdict import lines_used
+
+# Of the poses among which an image does not decide so many are laid on the next; on a map with
+# many places alike its own search finds the others again.
+_CARRIED = 8
+
+
+def the_one_expected(
+    held: Sequence[Found], left: Sequence[Candidate], told: Told | None,
+    prediction: Prediction | None, options: LocaliserOptions,
+) -> Found | None:
+    """The one pose that a prior or a prediction expects, if it is one of the best of all.
+
+    :param held: the poses that explain the image, best first.
+    :param left: poses that may explain it as well, but were not laid on it.
+    :param told: where the prediction, or without one a prior, says that the robot is.
+    """
+    if told is None:
+        return None
+    near = [f for f in held if (
+        told.holds(f.alignment.pose, f.alignment.covariance) if prediction is None
+        else is_expected(f.alignment, prediction, options.innovation_gate))]
+    if not near or any(told.holds(c.pose) for c in left):
+        return None
+    best, ratio = near[0], options.ambiguity_ratio
+    if best.score < ratio * held[0].score or any(
+            f.score >= ratio * best.score for f in near[1:]):
+        return None
+    return best
+
+
+def left_open(
+    hypotheses: Sequence[Hypothesis], held: Sequence[Found], sifted: Sifted,
+) -> tuple[tuple[Hypothesis, ...], list[Hypothesis]]:
+    """The poses among which an image has not decided, and the next one may.
+
+    :param hypotheses: those that were open before it.
+    :param held: the poses that explain it, best first.
+    :param sifted: what else the search of it left.
+    :returns: those to be laid on the next image, and others that may be right as well.
+    """
+    best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
+    others = sorted(
+        (*others, *(Hypothesis(c.pose, (c.score,)) for c in sifted.open)), key=lambda h: -h.mean)
+    carried_on = (best, *others[:_CARRIED - 1])
+    if lines_used(held[0].alignment) < 3:
+        carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
+    return carried_on, others[_CARRIED - 1:]

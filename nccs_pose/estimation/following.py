@@ -1,0 +1,98 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lays the pose expected of an image on it, and now and then looks for a better one."""
+
+from __future__ import annotations
+
+from collections.abc import Set
+
+from nccs_pose.estimation.alignment import Aligner
+from nccs_pose.estimation.association import same_pose
+from nccs_pose.estimation.judge import Found, is_expected, Judge
+from nccs_pose.estimation.motion import Prediction
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.sifting import Refused
+from nccs_pose.estimation.stopwatch import Stopwatch
+from nccs_pose.estimation.verdict import contradiction, Objection
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.vision.colour import LineColour
+import numpy as np
+from numpy.typing import NDArray
+
+# A pose elsewhere must beat the tracked one by this much to unseat it.
+_BETTER = 0.15
+
+
+class Follower:
+    """Follows a robot from image to image, for one rig and map."""
+
+    def __init__(
+        self, aligner: Aligner, searcher: Searcher, judge: Judge, line_map: LineMap,
+        options: LocaliserOptions,
+    ) -> None:
+        self._aligner = aligner
+        self._searcher = searcher
+        self._judge = judge
+        self._map = line_map
+        self._options = options
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew, with a pose that the whole image has shown."""
+        self._frames_since_check = 0
+
+    def follow(
+        self, image: NDArray[np.uint8], prediction: Prediction, colours: tuple[LineColour, ...],
+        doubts: Set[int], watch: Stopwatch,
+    ) -> Found | Refused:
+        """Lay a predicted pose on an image; refused where the whole must be searched.
+
+        :param image: (H, W, 3) uint8 BGR.
+        :param doubts: lines that were seen beside their place and not in it since.
+        """
+        prior = (prediction.pose, prediction.covariance)
+        refused = Refused()
+        for reach in (0.0, self._options.band):
+            alignment = self._aligner.align(
+                image, prediction.pose, colours, reach=reach, prior=prior)
+            watch.lap('measure')
+            if alignment is None or not is_expected(
+                    alignment, prediction, self._options.innovation_gate):
+                continue
+            against = self._judge.objection(image, alignment, doubts, expected=True)
+            if against is None:
+                break
+            refused = Refused(against, alignment)
+        else:
+            return refused
+        self._frames_since_check += 1
+        due = self._frames_since_check >= self._options.check_every
+        if not (due or alignment.missing or len(alignment.lines) == 1):
+            return Found(alignment, float('nan'), alignment.explained)
+        self._frames_since_check = 0
+        segments = self._searcher.segments(image)
+        watch.lap('detect')
+        against = contradiction(alignment, segments, self._map)
+        if against is not None:
+            return Refused(against, alignment)
+        here, claimed = self._searcher.score(alignment.pose, segments)
+        # No score exceeds 1.
+        elsewhere = self._searcher.candidates(segments) if here + _BETTER < 1.0 else ()
+        watch.lap('associate')
+        if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
+                elsewhere[0].pose, alignment.pose):
+            return Refused(Objection('another pose explains the image better'), alignment)
+        return Found(alignment, claimed, alignment.explained)
