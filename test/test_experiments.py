@@ -268,6 +268,9 @@ def test_the_benchmark_command(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert list(results['seconds']) == list(benchmark.CELLS)
     for timings in results['seconds'].values():
         assert all(len(seconds) == 3 and min(seconds) > 0.0 for seconds in timings.values())
+    for mode, counted in (('tracking', 3), ('searching', 3)):
+        times = results['stages']['modes'][mode]
+        assert len(times['frame']) == len(times['threshold']) == counted
     # the outside checks: scipy ends at the same minimum, PoseLib agrees without noise
     assert results['least_squares_apart'] < 1e-6
     if results['poselib_apart'] is not None:

@@ -18,11 +18,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from nccs_pose.cli.progress import Progress
-from nccs_pose.evaluation.benchmark import as_json, CELLS, report, run_benchmark
-from nccs_pose.evaluation.stages import LEAST_FRAMES, measure_stages, stages_table
+from nccs_pose.evaluation import stages
+from nccs_pose.evaluation.benchmark import as_numbers, CELLS, report, run_benchmark
 from nccs_pose.files.text_files import check_writable, write_text
 
 _WIDTH = 1280  # px, of the images whose stages are timed
@@ -41,11 +42,12 @@ def run(arguments: argparse.Namespace) -> int:
     with Progress(len(CELLS) * max(0, arguments.repetitions), 'scenes') as progress:
         benchmark = run_benchmark(arguments.repetitions, progress.step)
     print(report(benchmark))
-    frames = max(arguments.repetitions, LEAST_FRAMES)
+    frames = max(arguments.repetitions, stages.LEAST_FRAMES)
     with Progress(3 * frames - 2, 'frames') as progress:
-        costs = measure_stages(_WIDTH, frames, progress=progress.step)
-    print(stages_table(costs))
+        costs = stages.measure_stages(_WIDTH, frames, progress=progress.step)
+    print(stages.stages_table(costs))
     if arguments.output is not None:
-        write_text(arguments.output, as_json(benchmark))
+        write_text(arguments.output, json.dumps(
+            {**as_numbers(benchmark), 'stages': stages.as_numbers(costs)}, indent=1) + '\n')
         print(f'Written: {arguments.output}')
     return 0

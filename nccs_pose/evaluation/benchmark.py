@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-import json
 import os
 import platform
 import time
@@ -253,12 +252,12 @@ def _machine() -> str:
         f'{platform.machine()}, {os.cpu_count()} cores')
 
 
-def as_json(benchmark: Benchmark) -> str:
-    """All repetitions, so that anybody can make other statistics of them."""
-    return json.dumps({
+def as_numbers(benchmark: Benchmark) -> dict[str, Any]:
+    """All repetitions for JSON, so that anybody can make other statistics of them."""
+    return {
         'machine': _machine(),
         'seconds': {
             scene: {name: timing.seconds.tolist() for name, timing in timings.items()}
             for scene, timings in benchmark.timings.items()},
         'least_squares_apart': benchmark.least_squares_apart,
-        'poselib_apart': benchmark.poselib_apart}, indent=1) + '\n'
+        'poselib_apart': benchmark.poselib_apart}
