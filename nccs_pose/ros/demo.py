@@ -50,7 +50,7 @@ from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -169,7 +169,9 @@ def _demo(options: argparse.Namespace) -> int:
         player = Player(user, bag, Playback(
             rate=options.rate, topics=tuple(topic for topic in played if topic)))
         localiser = _start_localiser(options.params, image, topics.camera_info, topics.odom)
-        spinning = threading.Thread(target=_spin, args=(user,), daemon=True)
+        executor = SingleThreadedExecutor()
+        executor.add_node(user)
+        spinning = threading.Thread(target=_spin, args=(executor,), daemon=True)
         spinning.start()
         try:
             _say(f'localiser started; waiting until it listens to {image}')
@@ -179,7 +181,8 @@ def _demo(options: argparse.Namespace) -> int:
             _play(player, bag, image, record, options.rate)
         finally:
             _stop(localiser)
-            rclpy.try_shutdown()
+            # Before ROS itself, which would leave the callback that is due for Python to warn of.
+            executor.shutdown(5.0)
             spinning.join(5.0)
     return _conclude(record, truth, options, user.pictures)
 
@@ -214,9 +217,9 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
         process.kill()
 
 
-def _spin(node: Node) -> None:
+def _spin(executor: SingleThreadedExecutor) -> None:
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
+        executor.spin()
 
 
 def _play(player: Player, bag: SerialisedBag, image: str, record: Record, rate: float) -> None:
