@@ -77,8 +77,8 @@ def test_derivatives_of_pixels_are_those_of_the_exact_projection(
         exact(points + step * direction) for step in (h, 0.0, -h))
     seen = a & b & c
     assert seen.sum() > 100
-    found = table.expand(points)
-    _, by_step, by_conjugate, twice, mixed, conjugate_twice = found.terms.T
+    found = table.expand(as_complex(points))
+    _, by_step, by_conjugate, twice, mixed, conjugate_twice = found.terms
     step = as_complex(direction)
     back = step.conj()
     np.testing.assert_allclose(
@@ -89,6 +89,18 @@ def test_derivatives_of_pixels_are_those_of_the_exact_projection(
     # The curve's bend counts over some pixels along it only.
     found_bend = as_points(twice * step**2 + 2.0 * mixed + conjugate_twice * back**2)
     assert np.median(np.abs(found_bend - bend)[seen]) < 0.01 * np.abs(bend[seen]).max()
+
+
+def test_it_is_known_about_where_points_are_seen(rig: Rig, table: FloorTable) -> None:
+    found = table.expand(as_complex(_floor_points(rig, 1.2 * REACH)))
+    pixels = as_points(found.pixels)
+    near = [table.sees_floor(pixels + 5.0 * np.array(way)) for way in (
+        (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))]
+    inside, outside = np.all(near, axis=0), ~np.any(near, axis=0)
+    assert inside.sum() > 200
+    assert outside.sum() > 200
+    assert found.seen[inside].all()
+    assert not found.seen[outside].any()
 
 
 def test_the_region_is_where_pixels_see_the_floor(rig: Rig, table: FloorTable) -> None:

@@ -20,12 +20,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 import math
 
-from nccs_pose.geometry.floor_table import (
-    as_complex,
-    as_points,
-    Complex,
-    FloorTable,
-)
+from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import Bands
@@ -44,6 +39,13 @@ _GAPS = 256
 # So many stations at most, on all lines together.
 _MOST = 1500
 _LEVEL = np.zeros(3)
+# The terms of an expansion by the direction of a line: by which powers of it they go, and what the
+# pixel, its derivatives ahead on the line and to its left, the second ones (ahead, twice the
+# mixed one, to the left) are of them.
+_TURNS = np.array([0, 1, -1, 2, 0, -2])
+_TO_LINE = np.array([
+    [1, 0, 0, 0, 0, 0], [0, 1, 1, 0, 0, 0], [0, 1j, -1j, 0, 0, 0],
+    [0, 0, 0, 1, 2, 1], [0, 0, 0, 2j, 0, -2j], [0, 0, 0, -1, 2, -1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +82,13 @@ class BandPredictor:
             dtype=np.intp)
         self._start = as_complex(line_map.starts[self._lines, :2])
         self._direction = as_complex(line_map.directions[self._lines, :2])
-        self._left = as_points(1j * self._direction)
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        distance = np.linspace(0.0, self._length, _COARSE, axis=1)
+        # Half width, length, parts (see _GAPS) per metre and direction to the left, by rows.
+        self._tapes = np.array([
+            self._half_width, self._length, _GAPS / self._length,
+            -self._direction.imag, self._direction.real])
+        distance = np.linspace(0.0, 1.0, _COARSE) * self._length[:, None]
         self._samples = (self._start[:, None] + distance * self._direction[:, None]).ravel()
         self._distance = distance.ravel()
         self._slope = _SLOPE * np.arange(distance.size)
@@ -100,17 +105,16 @@ class BandPredictor:
         :param lines: of the map that get any; None for all.
         """
         tapes = len(self._lines)
-        pixels = self._table.pixels(as_points(
-            (self._samples - complex(pose.x, pose.y)) * _turned_back(pose)))
-        visible, curve = self._table.sees_floor(pixels), as_complex(pixels)
+        image = self._table.expand(
+            (self._samples - complex(pose.x, pose.y)) * _turned_back(pose))
+        curve, seen = image.pixels.reshape(-1, _COARSE), image.seen.reshape(-1, _COARSE)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
         # invertible.
-        steps = np.abs(curve[1:] - curve[:-1])
-        steps *= visible[1:] & visible[:-1]
-        steps[_COARSE - 1::_COARSE] = 0.0
-        axis = np.zeros(len(curve))
-        steps.cumsum(out=axis[1:])
+        steps = np.zeros((tapes, _COARSE))
+        np.abs(curve[:, 1:] - curve[:, :-1], out=steps[:, 1:])
+        steps[:, 1:] *= seen[:, 1:] & seen[:, :-1]
+        axis = steps.cumsum()
         begin = axis[::_COARSE]
         length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
         count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
@@ -139,55 +143,51 @@ class BandPredictor:
         number, distance = places.number, places.distance
         turn = _turned_back(pose)
         origin = (self._start - complex(pose.x, pose.y)) * turn
-        ahead_of = (self._direction * turn).take(number)
+        ahead = self._direction * turn
+        ahead_of = ahead.take(number)
         middle = origin.take(number) + distance * ahead_of
         if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
-        image = self._table.expand(as_points(middle))
-        behind_of = ahead_of.conj()
-        pixels, by_step, by_conjugate, twice, mixed, conjugate_twice = image.terms.T
-        by_step, by_conjugate = by_step * ahead_of, by_conjugate * behind_of
-        twice, conjugate_twice = (
-            twice * (ahead_of * ahead_of), conjugate_twice * (behind_of * behind_of))
+        image = self._table.expand(middle)
         # How the pixel goes as the point goes ahead on the line, and to its left.
-        ahead, aside = by_step + by_conjugate, 1j * (by_step - by_conjugate)
-        speed = np.maximum(np.abs(ahead), 1e-9)
-        tangent = ahead / speed
-        turned = aside * tangent.conj()
+        pixels, by_ahead, by_left, twice_ahead, twice_mixed, twice_left = _TO_LINE @ (
+            image.terms * (ahead ** _TURNS[:, None]).take(number, axis=1))
+        speed = np.abs(by_ahead)
+        turned = by_left / by_ahead
+        tapes = self._tapes.take(number, axis=1)
+        (half, length, gaps_per_metre), left = tapes[:3], tapes[3:]
         # The cut across the tape whose image is normal to the curve leans along the line.
-        lean = turned.real / -speed
-        gain = np.maximum(np.abs(turned.imag), 1e-9)
-        across = np.copysign(1.0, turned.imag) * 1j * tangent
-        bend = _dot(twice + 2.0 * mixed + conjugate_twice, across) / (speed * speed)
-        half = self._half_width.take(number)
-        cut = half * (lean + 1j)
-        square = cut * cut
+        lean = -turned.real
+        gain = np.abs(turned.imag) * speed
+        # One over the speed, negative where the image is reflected.
+        slowness = np.copysign(1.0, turned.imag) / speed
+        across = 1j * slowness * by_ahead
+        bend = slowness * (twice_ahead / by_ahead).imag
         # The two edges lie unequally far from the midline: a matter of the second order.
-        centre = as_points(pixels + 0.5 * (
-            square * twice + 2.0 * np.abs(square) * mixed + square.conj() * conjugate_twice))
-        # Near its ends the leaning cut would leave the tape.
-        reach = half * np.abs(lean)
+        centre = as_points(pixels + 0.5 * half * half * (
+            (twice_ahead * lean + twice_mixed) * lean + twice_left))
         half_width = half * gain
-        length = self._length.take(number)
         gap = self._gap.take(
-            number * _GAPS + (distance * (_GAPS / length)).astype(np.intp), mode='clip')
+            number * _GAPS + (distance * gaps_per_metre).astype(np.intp), mode='clip')
+        # Near its ends the leaning cut would leave the tape.
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
-                & (np.minimum(distance, length - distance) > reach))
+                & (np.minimum(distance, length - distance) > half * np.abs(lean)))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number))
-        slide = np.empty((6, len(number))).T
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
         # along its line does not count.
-        np.multiply(-gain[:, None], self._left.take(number, axis=0), out=slide[:, :2])
-        np.multiply(-gain, (behind_of * middle).real, out=slide[:, 2])
+        slide = np.empty((6, len(number)))
+        against, back = -gain, ahead_of.conj()
+        np.multiply(against, left, out=slide[:2])
+        np.multiply(against, (back * middle).real, out=slide[2])
         # Floor that sinks by dz is seen where the ray would have met it, further out.
-        sinking = -gain * (behind_of * image.offset).imag * self._table.falls(image.radius)
-        slide[:, 3] = sinking
-        np.multiply(sinking, middle.imag, out=slide[:, 4])
-        np.multiply(-sinking, middle.real, out=slide[:, 5])
+        sinking = against * (back * image.offset).imag * image.falls
+        slide[3] = sinking
+        np.multiply(sinking, middle.imag, out=slide[4])
+        np.multiply(-sinking, middle.real, out=slide[5])
         if np.count_nonzero(keep) == len(keep):
-            return bands, slide
-        return bands[keep], slide[keep]
+            return bands, slide.T
+        return bands[keep], slide[:, keep].T
 
     def _gaps(self) -> Array:
         """Floor between a tape's edge and the next tape (L, G), metres, along each tape."""
@@ -225,8 +225,3 @@ def _leant(points: Array, attitude: Array) -> tuple[Array, Array]:
     leant[:, 0] = math.cos(pitch) * x + math.sin(pitch) * z
     leant[:, 1] = math.cos(roll) * y + math.sin(roll) * up
     return leant, math.cos(roll) * up - math.sin(roll) * y
-
-
-def _dot(a: Complex, b: Complex) -> Array:
-    """Dot products (N,) of vectors as complex numbers (N,)."""
-    return a.real * b.real + a.imag * b.imag

@@ -33,11 +33,20 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, spline_filter
 
 # The angle from the nadir varies almost linearly with the image radius, so a coarse grid in
-# (angle, azimuth) with cubic splines is enough.
+# (angle, azimuth) with cubic splines is enough to make the table from.
 _ANGLES = 64
 _AZIMUTHS = 128
 _PADDING = 8
 _STRIDE = 8
+# What is read are expansions at the knots of a square grid over the stereographic plane, where the
+# floor is a disc and its image almost linear: so fine that the nearest knot's is good enough. So
+# many knots to either side of the middle; from one to the next, right and up, and where the middle
+# one is.
+_CELLS = 112
+_KNOTS_APART = np.array([1.0, 2.0 * _CELLS + 1.0])
+_MIDDLE_KNOT = _CELLS * _KNOTS_APART.sum()
+# What lies beyond the table is seen outside of any image, and goes on from there as it will.
+_OUTSIDE = np.array([-1e6, 1.0, 0.0, 0.0, 0.0, 0.0])
 # Where the nadir, and straight ahead, are in the grid.
 _BEGIN = np.array([[_PADDING], [_PADDING + 0.5 * _AZIMUTHS]])
 # Weights of the four coefficients of a cubic spline about a point as polynomials in its place t
@@ -84,19 +93,22 @@ class FloorExpansion:
     Pixels u + iv and vectors of the floor x + iy, in base_link, are complex numbers. A point that
     goes by d is seen at p + P d + Q d* + (U d^2 + 2 V |d|^2 + W d*^2) / 2, d* the conjugate.
 
-    :ivar terms: p, P, Q, U, V and W by columns (N, 6); px, px per metre, px per square metre.
+    :ivar terms: p, P, Q, U, V and W by rows (6, N); px, px per metre, px per square metre.
     :ivar offset: of the points from the mirror's foot (N,), metres.
-    :ivar radius: its length (N,).
+    :ivar falls: how far outward over the floor a ray goes as it falls by a metre, in parts of the
+        offset (N,).
+    :ivar seen: whether the image shows the floor about there (N,), to a few px.
     """
 
     terms: Complex
     offset: Complex
-    radius: Array
+    falls: Array
+    seen: NDArray[np.bool_]
 
     @property
     def pixels(self) -> Complex:
         """Where the points themselves are seen (N,)."""
-        return self.terms[:, 0]
+        return self.terms[0]
 
 
 class FloorTable:
@@ -125,8 +137,6 @@ class FloorTable:
         spline = self._forward()
         rows, self._columns = spline.shape
         self._last_row = rows - 2.0 - 1e-9
-        self._knots = spline.view(np.float64).reshape(-1, 2)
-        self._terms = self._expansions(spline).view(np.float64).reshape(-1, 12)
         self._taps = (np.arange(-1, 3)[:, None] * self._columns + np.arange(-1, 3)).ravel()
         self._grid, self._grid_reaches = self._backward()
         self.region = self._region()
@@ -136,6 +146,7 @@ class FloorTable:
         # From one pixel to the next, right and down, and where the first one is.
         self._apart = np.array([1.0, rig.camera.width + 2.0])
         self._first = rig.camera.width + 3.0
+        self._knots = self._expanded(self._expansions(spline).view(np.float64).reshape(-1, 12))
 
     def _forward(self) -> Complex:
         """Spline coefficients of the pixels over (angle from the nadir, azimuth from -pi)."""
@@ -216,6 +227,28 @@ class FloorTable:
             terms[k] = _filtered(terms[k])
         return np.ascontiguousarray(terms.transpose(1, 2, 0))
 
+    def _expanded(self, coefficients: Array) -> Complex:
+        """What is known at the knots (M, 8).
+
+        The terms there, the knot's offset from the mirror's foot, and the falls, with 1 for the
+        imaginary part where the floor is seen.
+
+        :param coefficients: of the terms over angle and azimuth (angles x azimuths, 12).
+        """
+        cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
+        knots = np.empty((len(cells), len(cells), 8), dtype=complex)
+        for row, y in zip(knots, cells):
+            place = cells + 1j * y
+            # Infinity is the unit circle; what lies on it or beyond is far enough.
+            offset = place * (2.0 * self.height / np.maximum(1.0 - np.abs(place) ** 2, 1e-3))
+            radius = np.abs(offset)
+            row[:, :6] = self._read(coefficients, offset, radius).view(np.complex128)
+            row[self._places(offset, radius)[0] >= self._last_row, :6] = _OUTSIDE
+            row[:, 6] = offset
+            row[:, 7] = np.interp(radius, *self._outward) + 1j * self.sees_floor(
+                as_points(row[:, 0]))
+        return knots.reshape(-1, 8)
+
     def _rays(
         self, points: Array, m: Array, seen: NDArray[np.bool_],
     ) -> tuple[Array, Array]:
@@ -236,13 +269,6 @@ class FloorTable:
             falls[row, ~seen[row]] = falls[row - 1, ~seen[row]]
         return mirror, falls
 
-    def falls(self, radius: Array) -> Array:
-        """How far outward over the floor a ray goes as it falls by a metre, over the radius (N,).
-
-        :param radius: where it meets the floor, from the mirror's foot (N,), metres.
-        """
-        return np.interp(radius, *self._outward)
-
     def met(self, points: Array, rise: Array) -> Array:
         """Where rays that see points over the floor meet it (N, 2), in base_link.
 
@@ -258,15 +284,27 @@ class FloorTable:
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
-        offset = as_complex(points) - self._foot
-        return self._read(self._knots, offset, np.abs(offset))
+        return as_points(self.expand(as_complex(points)).pixels)
 
-    def expand(self, points: Array) -> FloorExpansion:
-        """Pixels of ground points (N, 2) in base_link with their first and second derivatives."""
-        offset = as_complex(points) - self._foot
-        radius = np.abs(offset)
-        return FloorExpansion(
-            self._read(self._terms, offset, radius).view(np.complex128), offset, radius)
+    def expand(self, points: Complex) -> FloorExpansion:
+        """Pixels of ground points x + iy (N,) in base_link, with their derivatives.
+
+        From the nearest knot on, to second order.
+        """
+        offset = points - self._foot
+        # In steps from knot to knot.
+        place = offset * (_CELLS / (self.height + np.hypot(np.abs(offset), self.height)))
+        nearest = np.rint(place).view(np.float64).reshape(-1, 2) @ _KNOTS_APART + _MIDDLE_KNOT
+        knots = self._knots.take(nearest.astype(np.intp), axis=0, mode='clip')
+        terms = np.ascontiguousarray(knots[:, :6].T)
+        step = offset - knots[:, 6]
+        back = step.conj()
+        # Half of what the step adds to the first derivatives; the pixel goes by their mean.
+        slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
+        slopes += added
+        terms[0] += slopes[0] * step + slopes[1] * back
+        slopes += added
+        return FloorExpansion(terms, offset, knots[:, 7].real, knots[:, 7].imag > 0.0)
 
     def _read(self, coefficients: Array, offset: Complex, radius: Array) -> Array:
         """Values (N, K) of splines at floor points.
