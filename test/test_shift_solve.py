@@ -129,6 +129,25 @@ def test_no_station_stands_where_another_tape_is_beside_it() -> None:
     assert nearest.min() > 2.5
 
 
+def test_every_line_has_whole_groups_of_neighbours() -> None:
+    # Where they cross, stations of both are given up.
+    crossing = LineMap(tuple(
+        Line(np.array([*start, 0.0]), np.array([*end, 0.0]), 0.05)
+        for start, end in [((1.5, -1.0), (1.7, 1.3)), ((0.9, 0.3), (2.1, 0.4))]))
+    predictor = BandPredictor(FloorTable(RIG, 5.0), crossing)
+    places = predictor.places(POSE, 2.0, 75)
+    for chosen in (places, places.every(4)):
+        bands, slide = predictor.bands(chosen, POSE)
+        assert bands.members > 1
+        assert len(slide) == len(bands)
+        for number in (chosen.number, bands.label):
+            assert (np.bincount(number) % bands.members == 0).all()
+    # As long a stretch of line as may share one floor, px.
+    assert 10.0 < bands.members * bands.spacing.mean() < 24.0
+    kept = predictor.bands(places, POSE)[0]
+    assert 0 < len(places) - len(kept) < 0.3 * len(places)
+
+
 def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> None:
     rng = np.random.default_rng(1)
     sigma = rng.uniform(0.5, 2.0, len(slide))

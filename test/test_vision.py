@@ -75,12 +75,13 @@ def _straight_bands(
     along, across = np.array([np.cos(angle), np.sin(angle)]), np.array(
         [-np.sin(angle), np.cos(angle)])
     middle = np.array([0.5 * WIDTH + 0.31, 0.5 * HEIGHT - 0.17])
-    n = int(360 / spacing)
+    members = max(round(16.0 / spacing), 1)
+    n = int(360 / spacing) // members * members
     s = (np.arange(n) - 0.5 * (n - 1)) * spacing
     centre = middle + s[:, None] * along - shift * across
     return Bands(
         centre, centre, np.tile(across, (n, 1)), np.zeros(n), np.full(n, half_width),
-        np.full(n, spacing), np.zeros(n, dtype=np.intp))
+        np.full(n, spacing), np.zeros(n, dtype=np.intp), members)
 
 
 @pytest.mark.parametrize('half_width', [0.3, 0.6, 1.2, 3.0, 6.0])

@@ -222,16 +222,15 @@ class Aligner:
             return fit, (learned,)
         n = len(bands)
         shift, sigma = np.zeros(n), np.ones(n)
-        found, group = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.intp)
+        found = np.zeros(n, dtype=bool)
         learned_all = list(colours)
         for k, colour in enumerate(colours):
             own = self._colour_of_line[bands.label] == k
             if own.any():
                 fit, learned_all[k] = fit_profiles(
                     image, bands[own], colour, rough=rough)
-                shift[own], sigma[own] = fit.shift, fit.sigma
-                found[own], group[own] = fit.found, k * n + fit.group
-        return ProfileFit(shift, sigma, found, group), tuple(learned_all)
+                shift[own], sigma[own], found[own] = fit.shift, fit.sigma, fit.found
+        return ProfileFit(shift, sigma, found), tuple(learned_all)
 
     def _search(
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
@@ -282,7 +281,7 @@ class Aligner:
             return None
         refinement = self._solved(
             (fit.shift + slide[:, 3:] @ attitude).take(used), fit.sigma.take(used),
-            slide.take(used, axis=0), fit.group.take(used), bands.label.take(used),
+            slide.T.take(used, axis=1).T, used // bands.members, bands.label.take(used),
             bands.across.take(used, axis=0), start, prior)
         leant = slide[:, 3:] @ (refinement.attitude - attitude)
         moved = slide[:, :3] @ refinement.pose.minus(start) + leant
@@ -301,7 +300,7 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     residual = refinement.residual.take(inlier)
     sigma, label = fit.sigma.take(index), bands.label.take(index)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
-    first, members = runs(fit.group.take(index))
+    first, members = runs(index // bands.members)
     together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
     misfit = common_misfit(
         np.add.reduceat(residual, first) / np.sqrt(members), together, label.take(first))

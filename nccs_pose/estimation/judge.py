@@ -102,7 +102,7 @@ class Judge:
         found = objection(alignment, self._map, self._options, expected=expected)
         # Out of nothing every line in view is looked at, else those that leave a question.
         least = _WEAK if expected else np.inf
-        asked = {*np.flatnonzero(alignment.support < least).tolist(),
+        asked = {*(alignment.support < least).nonzero()[0].tolist(),
                  *(k for k in doubts if alignment.support[k] >= 0.0)}
         if found is not None or not asked:
             return found
@@ -191,7 +191,7 @@ def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float
 
 def lines_shown(alignment: Alignment) -> frozenset[int]:
     """The lines that a pose shows in their places, most of each."""
-    return frozenset(np.flatnonzero(alignment.support >= _WEAK).tolist())
+    return frozenset((alignment.support >= _WEAK).nonzero()[0].tolist())
 
 
 def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:

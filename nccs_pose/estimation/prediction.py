@@ -23,10 +23,12 @@ import math
 from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.bands import Bands, runs
 import numpy as np
 from numpy.typing import NDArray
 
+# Neighbours over about so many px share what they know of the floor, the contrast and the noise.
+_SHARED_PX = 16.0
 # Coarse samples of each line, between which its image's length is interpolated.
 _COARSE = 32
 _SLOPE = 1e-9
@@ -55,20 +57,22 @@ class Places:
     :ivar number: of the line among the floor tapes (N,).
     :ivar distance: from the line's start (N,), metres.
     :ivar spacing: length of curve that the station stands for (N,), px.
+    :ivar members: of each group of neighbours, one after the other; every line has whole groups.
     """
 
     number: NDArray[np.intp]
     distance: Array
     spacing: Array
+    members: int
 
     def __len__(self) -> int:
         return len(self.number)
 
     def every(self, step: int) -> Places:
-        """One out of so many."""
+        """One group out of so many."""
+        at = np.arange(len(self)).reshape(-1, self.members)[step // 2::step].ravel()
         return Places(
-            self.number[step // 2::step], self.distance[step // 2::step],
-            self.spacing[step // 2::step])
+            self.number.take(at), self.distance.take(at), self.spacing.take(at), self.members)
 
 
 class BandPredictor:
@@ -120,6 +124,10 @@ class BandPredictor:
         count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
         if lines is not None:
             count[~np.isin(self._lines, list(lines))] = 0
+        # All groups are equal, so that what is summed over them needs no list of their sizes.
+        shown = max(float(length @ (count > 0)), spacing)
+        members = max(round(_SHARED_PX * int(count.sum()) / shown), 1)
+        count -= count % members
         number = np.arange(tapes).repeat(count)
         first = count.cumsum() - count
         each = length / np.maximum(count, 1)
@@ -127,7 +135,7 @@ class BandPredictor:
         where = np.arange(0.5, len(number)) * spacing_px + (
             begin + _END - first * each).take(number)
         distance = np.interp(where, axis + self._slope, self._distance)
-        return Places(number, distance, spacing_px)
+        return Places(number, distance, spacing_px, members)
 
     def bands(
         self, places: Places, pose: Pose2, attitude: Array = _LEVEL,
@@ -173,7 +181,7 @@ class BandPredictor:
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
                 & (np.minimum(distance, length - distance) > half * np.abs(lean)))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
-                      places.spacing, self._lines.take(number))
+                      places.spacing, self._lines.take(number), places.members)
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
         # along its line does not count.
         slide = np.empty((6, len(number)))
@@ -187,6 +195,7 @@ class BandPredictor:
         np.multiply(-sinking, middle.real, out=slide[5])
         if np.count_nonzero(keep) == len(keep):
             return bands, slide.T
+        keep = _whole_groups(keep, number, places.members)
         return bands[keep], slide[:, keep].T
 
     def _gaps(self) -> Array:
@@ -202,6 +211,23 @@ class BandPredictor:
             gap[k] = np.inf
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width[:, None]
+
+
+def _whole_groups(
+    keep: NDArray[np.bool_], number: NDArray[np.intp], members: int,
+) -> NDArray[np.bool_]:
+    """Which of N stations to keep so that the groups of each line are whole again.
+
+    :param keep: those that can be kept (N,).
+    :param number: line of each (N,), ascending.
+    :param members: of a group.
+    """
+    at = keep.nonzero()[0]
+    if len(at):
+        first, count = runs(number.take(at))
+        place = np.arange(len(at)) - first.repeat(count)
+        keep[at[place >= (count - count % members).repeat(count)]] = False
+    return keep
 
 
 def _turned_back(pose: Pose2) -> complex:

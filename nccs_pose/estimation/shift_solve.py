@@ -81,24 +81,24 @@ def solve_shifts(
     """
     free, known, told = _prior(start, prior, attitude_sigma)
     rows = np.empty((len(free) + 1, len(shift)))
-    rows[:-1], rows[-1] = slide.T[free], shift
-    rows /= sigma
+    np.divide(slide.T[free], sigma, out=rows[:-1])
+    np.divide(shift, sigma, out=rows[-1])
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
     unknowns, trusted = _robust(
         np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
     inlier = trusted.repeat(members)
-    inliers = rows[:, inlier]
+    at, = inlier.nonzero()
+    inliers = rows.take(at, axis=1)
     squares = inliers @ inliers.T
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
     e = _residual(inliers, unknowns)
-    correlation = correlation_factor(e, label[inlier], len(free))
+    correlation = correlation_factor(e, label.take(at), len(free))
     inflation = correlation * _inflation(e, len(free))
-    unknowns = definite_solution(normal / inflation + known, right / inflation + told)
-    inflation = correlation * _inflation(_residual(inliers, unknowns), len(free))
     covariance = definite_solution(
         normal / inflation + known, _ONE[:len(free), :len(free)])
+    unknowns = covariance @ (right / inflation + told)
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
         answer = covariance @ (inliers[:-1] @ moved) * (calibration_sigma / inflation)

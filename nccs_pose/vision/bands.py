@@ -34,6 +34,8 @@ class Bands:
     :ivar half_width: half of the tape's width along ``across`` (N,), px.
     :ivar spacing: length of curve that the station stands for (N,), px.
     :ivar label: index of the line in the map (N,).
+    :ivar members: so many neighbours on a line, one after the other, are a group that shares what
+        is no shift; every line has whole groups.
     """
 
     centre: Array
@@ -43,16 +45,18 @@ class Bands:
     half_width: Array
     spacing: Array
     label: NDArray[np.intp]
+    members: int
 
     def __len__(self) -> int:
         return len(self.label)
 
     def __getitem__(self, index: NDArray[np.bool_]) -> Bands:
+        """Some of them, whole lines or groups."""
         at = index.nonzero()[0]
         return Bands(
             self.centre.take(at, axis=0), self.midline.take(at, axis=0),
             self.across.take(at, axis=0), self.bend.take(at), self.half_width.take(at),
-            self.spacing.take(at), self.label.take(at))
+            self.spacing.take(at), self.label.take(at), self.members)
 
 
 def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

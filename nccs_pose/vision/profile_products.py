@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 # At most so many pixels of a station are looked for across.
 _MOST_ACROSS = 31
-_SIDES = np.array([1.0, -1.0], np.float32)[:, None, None]
 
 
 def read_pixels(
@@ -90,7 +89,7 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 def profile_products(
     pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, blur: float,
-    first: NDArray[np.intp],
+    members: int,
 ) -> tuple[Array, Array, Array]:
     """What stations and groups say, in the products of templates and image with each other.
 
@@ -99,15 +98,17 @@ def profile_products(
 
     :param pixels: (N, P, 3) BGR.
     :param s: their place across the curve (N, P), px.
-    :param first: station of each group (G,).
+    :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (7, 8, G); those with D of each station (N, 8); and the floor's colour
+        over each group (7, 8, G); those with D of each station (8, N); and the floor's colour
         (3,), which the channels are less.
     """
     n, count = s.shape
     floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
-    wide = (half_width / blur).astype(np.float32)[:, None]
-    edges = s * np.float32(1.0 / blur) + _SIDES * wide
+    place, wide = s * np.float32(1.0 / blur), (half_width / blur).astype(np.float32)[:, None]
+    edges = np.empty((2, n, count), np.float32)
+    np.add(place, wide, out=edges[0])
+    np.subtract(place, wide, out=edges[1])
     square = np.square(edges)
     # The logistic function of a cubic is the normal distribution to 0.0003.
     rise = square * np.float32(-0.0713548)
@@ -124,20 +125,20 @@ def profile_products(
     np.subtract(steep[1], steep[0], out=rows[1])
     rows[2] = s
     np.subtract(edges[1], edges[0], out=rows[3])
+    channels = rows[4:7]
+    cv2.split(pixels.astype(np.float32), list(channels))
     # Numbers about zero keep their digits in sums of squares.
-    for k, channel in enumerate(cv2.split(pixels)):
-        np.subtract(channel, floor[k], out=rows[4 + k])
+    channels -= floor[:, None, None]
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
-    products = rows[:7].transpose(1, 0, 2) @ rows.transpose(1, 2, 0)
+    grouped = rows.reshape(8, -1, members * count)
+    pooled = grouped[:7].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
+    by_shift = (rows.transpose(1, 0, 2) @ rows[1, :, :, None])[..., 0]
     steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
     scale = np.array([1.0, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    # Taken for complex numbers they are half as many to add.
-    pooled = np.add.reduceat(products.reshape(n, 56).view(np.complex64), first, axis=0)
     return (np.multiply(
-        pooled.view(np.float32).T.reshape(7, 8, -1), scale[:7, None, None] * scale[:, None],
-        order='C'),
-            products[:, 1] * (steepness * scale), floor)
+        pooled.transpose(1, 2, 0), scale[:7, None, None] * scale[:, None], order='C'),
+            np.multiply(by_shift.T, (steepness * scale)[:, None], order='C'), floor)
 
 
 def _exponentiate(values: NDArray[np.float32]) -> NDArray[np.float32]:

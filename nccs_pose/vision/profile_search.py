@@ -48,7 +48,7 @@ def search_profiles(
     noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0 * together)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0),
-        pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION), rows)
+        pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION))
 
 
 def contrast_across(

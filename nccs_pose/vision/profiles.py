@@ -46,8 +46,6 @@ _LEAST_DENSITY = 0.45
 # A rough look takes fewer, and a softer template, which is felt from further away (px).
 _ROUGH_DENSITY = 0.5
 ROUGH_BLUR = 0.6
-# Stations over so many px share what they know of the floor, the contrast and the noise.
-_SHARED_PX = 16.0
 # At most so many rows of a station are looked for.
 _MOST_ALONG = 40
 # Neighbouring stations of one tape differ in contrast by about this fraction (shade, texture).
@@ -72,37 +70,11 @@ class ProfileFit:
     :ivar shift: delta (N,), px along ``across``.
     :ivar sigma: its standard deviation (N,), px.
     :ivar found: whether a tape is there at all (N,).
-    :ivar group: number of the stretch of line (N,) whose floor, contrast and noise it shares.
     """
 
     shift: Array
     sigma: Array
     found: NDArray[np.bool_]
-    group: NDArray[np.intp]
-
-
-class _Groups(NamedTuple):
-    """Neighbours on a line that share what is no shift.
-
-    :ivar first: member of each group (G,).
-    :ivar members: how many (G,).
-    :ivar number: group of each station (N,).
-    """
-
-    first: NDArray[np.intp]
-    members: NDArray[np.intp]
-    number: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, bands: Bands) -> _Groups:
-        """Parts of equal length of each line; the label ascends."""
-        begin, count = runs(bands.label)
-        # All stations of a line stand for pieces of the same length.
-        parts = np.minimum(np.maximum(count * bands.spacing[begin] // _SHARED_PX, 1.0), count)
-        share = parts / count
-        number = (np.arange(len(bands)) * share.repeat(count) + (
-            parts.cumsum() - parts - begin * share + 1e-9).repeat(count)).astype(np.intp)
-        return cls(*runs(number), number)
 
 
 def fit_profiles(
@@ -120,64 +92,59 @@ def fit_profiles(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
     pixels, s = read_pixels(image, bands, margin, rows)
-    groups, count = _Groups.of(bands), s.shape[1]
-    pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, groups.first)
-    size = count * groups.members
+    pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, bands.members)
+    count = s.shape[1]
+    size = bands.members * count
     means = pooled[:, 7] / size
-    centred = pooled[:, :7] - means[:, None] * pooled[:, 7]
-    system = _eliminated(centred)
+    system = _eliminated(pooled[:, :7] - means[:, None] * pooled[:, 7], size)
     if not rough:
-        colour = colour.learn(system.height, system.power, system.left / (size - 4), floor)
+        colour = colour.learn(system.height, system.power, system.left, floor)
     # Where the grid is finer than the pixels, across or along, each is counted several times.
-    half_width = bands.half_width.take(groups.first)
-    repeats = np.maximum(rows / bands.spacing.take(groups.first), 1.0) * np.maximum(
+    half_width = bands.half_width[::bands.members]
+    repeats = np.maximum(rows / bands.spacing[::bands.members], 1.0) * np.maximum(
         0.5 * count / rows / (half_width + margin), 1.0)
     fit, shared = _shifts(
-        by_shift, means, system, colour.discriminant, groups, size, repeats,
-        bands.label.take(groups.first), half_width)
+        by_shift, means, system, colour.discriminant, repeats, bands.label[::bands.members],
+        half_width)
     # A template beside its tape would take the misfit for blur.
     if not rough and median(np.abs(shared)) < _SHARP_PX:
-        share = centred[3, 0] / system.power
         weights = colour.discriminant
         colour = colour.sharpen(
-            weights @ system.height,
-            weights @ centred[3, 4:] - share * (weights @ centred[0, 4:]),
-            centred[3, 3] - share * centred[3, 0])
+            weights @ system.height, weights @ system.rest[3, 4:], system.rest[3, 3])
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
     return ProfileFit(
-        gain * fit.shift, gain * fit.sigma, fit.found, fit.group), colour
+        gain * fit.shift, gain * fit.sigma, fit.found), colour
 
 
 class _System(NamedTuple):
     """The normal equations of G groups after elimination: contrast, floor's slope, shift.
 
     :ivar power: of T (G,).
-    :ivar height: contrast of each channel (3, G).
-    :ivar by_shift: what a unit of D has of T (G,).
-    :ivar by_slope: what a unit of s has of T (G,).
-    :ivar slope_power, slope: what is left of s, and of its products with the channels (3, G).
-    :ivar own_power, own: what is left of D beside T, likewise.
-    :ivar crossed: product of the two (G,).
-    :ivar left: products of the channels with each other that no template explains (3, 3, G).
+    :ivar shares: what a unit of T, D, s, B and the channels has of T (7, G).
+    :ivar rest: what is then left of their products with each other (7, 7, G).
+    :ivar slope_power: of s in that (G,), and so of D, ``own_power``.
+    :ivar left: covariance of the channels that no template explains (3, 3, G).
     """
 
     power: Array
-    height: Array
-    by_shift: Array
-    by_slope: Array
+    shares: Array
+    rest: Array
     slope_power: Array
-    slope: Array
     own_power: Array
-    own: Array
-    crossed: Array
     left: Array
 
+    @property
+    def height(self) -> Array:
+        """Contrast of each channel (3, G)."""
+        return self.shares[4:]
 
-def _eliminated(products: Array) -> _System:
+
+def _eliminated(products: Array, size: int) -> _System:
     """Eliminate T from the rest, and all three from the channels.
 
     :param products: of T, D, s, B and the channels with each other (7, 7, G).
+    :param size: samples of each group.
     """
     power = np.maximum(products[0, 0], 1e-9)
     shares = products[0] / power
@@ -190,29 +157,29 @@ def _eliminated(products: Array) -> _System:
     alone_power = np.maximum(own_power - share * crossed, 1e-9)
     left = (rest[4:, 4:] - slope[:, None] * (slope / slope_power)
             - alone[:, None] * (alone / alone_power))
-    return _System(
-        power, shares[4:], shares[1], shares[2], slope_power, slope, own_power, own, crossed,
-        left)
+    # Mean, contrast, slope and shift have been fitted.
+    return _System(power, shares, rest, slope_power, own_power, left / (size - 4))
 
 
 def _shifts(
-    by_shift: Array, means: Array, system: _System, weights: Array, groups: _Groups,
-    size: NDArray[np.intp], repeats: Array, label: NDArray[np.intp], half_width: Array,
+    by_shift: Array, means: Array, system: _System, weights: Array, repeats: Array,
+    label: NDArray[np.intp], half_width: Array,
 ) -> tuple[ProfileFit, Array]:
     """Shifts and their noise along a colour's discriminant.
 
-    :param by_shift: products of the stations with D (N, 8).
+    :param by_shift: products of the stations with D (8, N).
     :param means: of T, D, s, B and the channels over each group (7, G).
     :param weights: the discriminant (3,).
-    :param size: samples of each group (G,).
     :param repeats: how often each pixel is among the samples of a group (G,).
     :param label: line of each group (G,), ascending.
     :param half_width: of its tape (G,), px.
     :returns: the stations' fit, and the shift of each group as a whole (G,), px.
     """
-    power, slope, first, of = system.power, weights @ system.slope, groups.first, groups.number
+    power, crossed = system.power, system.rest[1, 2]
+    members = by_shift.shape[1] // len(power)
+    own, slope = weights @ system.rest[1:3, 4:]
     squares = (weights[:, None] * weights).ravel()
-    variance = np.maximum(squares @ system.left.reshape(9, -1) / (size - 4), 1e-12)
+    variance = np.maximum(squares @ system.left.reshape(9, -1), 1e-12)
     usual = median(variance)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
@@ -220,11 +187,12 @@ def _shifts(
     # groups exceed their noise says how much of each is to be believed.
     excess = float((slope / (system.slope_power * variance)) @ slope) / len(slope) - 1.0
     belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
-    share = belief * system.crossed / system.slope_power
-    shift_power = np.maximum(system.own_power - share * system.crossed, 1e-9)
+    share = belief / system.slope_power
+    share *= crossed
+    shift_power = np.maximum(system.own_power - share * crossed, 1e-9)
     variance *= repeats
-    moved = (weights @ system.own - share * slope) / shift_power
-    a = weights @ system.height - system.by_shift * moved
+    moved = (own - share * slope) / shift_power
+    a = weights @ system.height - system.shares[1] * moved
     told = power / variance
     level, certain = _levels(label, a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
@@ -234,15 +202,16 @@ def _shifts(
     # What each station's pixels say to D beside the floor and the contrast of its group; the
     # weighted mean over the group is the group's own shift.
     tilt = belief * slope / system.slope_power - share * moved
-    height = a - system.by_slope * tilt
+    height = a - system.shares[2] * tilt
     base = weights @ means[4:] - height * means[0] - moved * means[1] - tilt * means[2]
-    own = (by_shift[:, 4:7] @ weights - height[of] * by_shift[:, 0] - tilt[of] * by_shift[:, 2]
-           - base[of] * by_shift[:, 7])
-    own_power = np.maximum(by_shift[:, 1], 1e-9)
-    noise = variance * np.add.reduceat(own_power, first) / (shift_power * np.square(smooth))
+    said = (weights @ by_shift[4:7] - height.repeat(members) * by_shift[0]
+            - tilt.repeat(members) * by_shift[2] - base.repeat(members) * by_shift[7])
+    own_power = np.maximum(by_shift[1], 1e-9)
+    noise = variance * own_power.reshape(-1, members).sum(axis=1) / (
+        shift_power * np.square(smooth))
     return ProfileFit(
-        own / (own_power * smooth[of]), np.sqrt(noise[of] / own_power), found[of], of
-    ), moved / smooth
+        said / (own_power * smooth.repeat(members)),
+        np.sqrt(noise.repeat(members) / own_power), found.repeat(members)), moved / smooth
 
 
 def median(values: Array) -> float:
@@ -255,10 +224,10 @@ def median(values: Array) -> float:
 def _levels(
     label: NDArray[np.intp], a: Array, weight: Array, told: Array, half_width: Array,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Each station's expected contrast, its line's weighted median, and whether that is sure.
+    """Each group's expected contrast, its line's weighted median, and whether that is sure.
 
-    :param label: line (N,), ascending.
-    :param half_width: of the tape (N,), px.
+    :param label: line (G,), ascending.
+    :param half_width: of the tape (G,), px.
     """
     first, count = runs(label)
     order = np.lexsort((a, label))
