@@ -125,10 +125,8 @@ def profile_products(
     np.subtract(steep[1], steep[0], out=rows[1])
     rows[2] = s
     np.subtract(edges[1], edges[0], out=rows[3])
-    channels = rows[4:7]
-    cv2.split(pixels.astype(np.float32), list(channels))
     # Numbers about zero keep their digits in sums of squares.
-    channels -= floor[:, None, None]
+    np.subtract(pixels.transpose(2, 0, 1), floor[:, None, None], out=rows[4:7])
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     grouped = rows.reshape(8, -1, members * count)
