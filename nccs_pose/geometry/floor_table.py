@@ -236,18 +236,21 @@ class FloorTable:
         :param coefficients: of the terms over angle and azimuth (angles x azimuths, 12).
         """
         cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
-        knots = np.empty((len(cells), len(cells), 8), dtype=complex)
-        for row, y in zip(knots, cells):
-            place = cells + 1j * y
-            # Infinity is the unit circle; what lies on it or beyond is far enough.
-            offset = place * (2.0 * self.height / np.maximum(1.0 - np.abs(place) ** 2, 1e-3))
-            radius = np.abs(offset)
-            row[:, :6] = self._read(coefficients, offset, radius).view(np.complex128)
-            row[self._places(offset, radius)[0] >= self._last_row, :6] = _OUTSIDE
-            row[:, 6] = offset
-            row[:, 7] = np.interp(radius, *self._outward) + 1j * self.sees_floor(
-                as_points(row[:, 0]))
-        return knots.reshape(-1, 8)
+        place: Complex = (cells + 1j * cells[:, None]).ravel()
+        # Infinity is the unit circle; what lies on it or beyond is far enough.
+        offset = place * (2.0 * self.height / np.maximum(1.0 - np.abs(place) ** 2, 1e-3))
+        radius = np.abs(offset)
+        knots = np.empty((len(place), 8), dtype=complex)
+        knots[:, :6] = _OUTSIDE
+        inside, = (self._places(offset, radius)[0] < self._last_row).nonzero()
+        # Some at a time: sixteen coefficients for each fill the memory.
+        for some in np.array_split(inside, len(cells)):
+            knots[some, :6] = self._read(
+                coefficients, offset[some], radius[some]).view(np.complex128)
+        knots[:, 6] = offset
+        knots[:, 7] = np.interp(radius, *self._outward) + 1j * self.sees_floor(
+            as_points(knots[:, 0]))
+        return knots
 
     def _rays(
         self, points: Array, m: Array, seen: NDArray[np.bool_],
