@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.bands import runs
+from nccs_pose.vision.bands import in_whole_parts
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,16 +74,10 @@ def common_misfit(residual: Array, sigma: Array, label: NDArray[np.intp]) -> flo
     :param sigma: their scale (N,), px.
     :param label: line (N,), ascending.
     """
-    start, count = runs(label)
-    # Blocks go from each line's start; what is left at its end is in none.
-    whole = count // _BLOCK
-    blocks = int(whole.sum())
-    begin = (start - _BLOCK * (whole.cumsum() - whole)).repeat(whole)
-    member = (begin + _BLOCK * np.arange(blocks))[:, None] + np.arange(_BLOCK)
-    in_px = (residual * sigma)[member]
+    in_px = (residual * sigma)[in_whole_parts(label, _BLOCK)].reshape(-1, _BLOCK)
     # Beyond what independent errors of this size give the blocks' means.
     beyond_noise = _square(in_px.sum(axis=1)) - _square(in_px)
-    return math.sqrt(max(0.0, beyond_noise) / max(1, blocks)) / _BLOCK
+    return math.sqrt(max(0.0, beyond_noise) / max(1, len(in_px))) / _BLOCK
 
 
 def root_mean_square(values: Array) -> float:

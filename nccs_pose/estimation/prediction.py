@@ -23,7 +23,7 @@ import math
 from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.vision.bands import Bands, runs
+from nccs_pose.vision.bands import Bands, in_whole_parts
 import numpy as np
 from numpy.typing import NDArray
 
@@ -195,7 +195,10 @@ class BandPredictor:
         np.multiply(-sinking, middle.real, out=slide[5])
         if np.count_nonzero(keep) == len(keep):
             return bands, slide.T
-        keep = _whole_groups(keep, number, places.members)
+        # The groups of each line are made whole again.
+        at, = keep.nonzero()
+        if len(at):
+            keep[at] = in_whole_parts(number.take(at), places.members)
         return bands[keep], slide[:, keep].T
 
     def _gaps(self) -> Array:
@@ -211,23 +214,6 @@ class BandPredictor:
             gap[k] = np.inf
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width[:, None]
-
-
-def _whole_groups(
-    keep: NDArray[np.bool_], number: NDArray[np.intp], members: int,
-) -> NDArray[np.bool_]:
-    """Which of N stations to keep so that the groups of each line are whole again.
-
-    :param keep: those that can be kept (N,).
-    :param number: line of each (N,), ascending.
-    :param members: of a group.
-    """
-    at = keep.nonzero()[0]
-    if len(at):
-        first, count = runs(number.take(at))
-        place = np.arange(len(at)) - first.repeat(count)
-        keep[at[place >= (count - count % members).repeat(count)]] = False
-    return keep
 
 
 def _turned_back(pose: Pose2) -> complex:

@@ -66,3 +66,10 @@ def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     np.not_equal(number[1:], number[:-1], out=edge[1:-1])
     at = edge.nonzero()[0]
     return at[:-1], at[1:] - at[:-1]
+
+
+def in_whole_parts(number: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
+    """Which of N > 0 are in parts of so many equal numbers (N,), from the start of each run on."""
+    first, count = runs(number)
+    place = np.arange(len(number)) - first.repeat(count)
+    return np.asarray(place < (count - count % size).repeat(count))
