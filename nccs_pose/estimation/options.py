@@ -48,7 +48,8 @@ class LocaliserOptions:
     stations: int = option(
         75, low=5, high=1000, live=True,
         doc='Points measured on each line, spread evenly along what is seen of it (75 as in the '
-            'paper); fewer where they would stand closer than 2 px.')
+            'paper), in whole groups of neighbours; fewer where they would stand closer than '
+            '2 px.')
     blur: float = option(
         0.7, unit='px', low=0.2, high=5.0, live=True,
         doc='Blur of an edge in the image, standard deviation: a start, each image says its own.')
