@@ -15,8 +15,9 @@
 """The floor seen through the mirror, tabulated: ground points to pixels and back, quickly.
 
 The exact maps cost microseconds a point; tracking asks for thousands of points a frame. Both
-tables are made once per rig. The forward one is good to a thousandth of a pixel; the
-backward one serves where a pixel's place on the floor need only be known roughly.
+tables are made once per rig. The forward one is good to 0.003 px up to 5 m and 0.007 px up to 9 m
+on images 1280 px wide, a tenth of that root mean square; the backward one serves where a pixel's
+place on the floor need only be known roughly.
 """
 
 from __future__ import annotations
