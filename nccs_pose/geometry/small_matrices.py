@@ -52,7 +52,8 @@ def solve_3x3(
     ax, ay = (yy * xz - xy * yz) / minor, (xx * yz - xy * xz) / minor
     bx, by = (yy * gx - xy * gy) / minor, (xx * gy - xy * gx) / minor
     pivot = zz - xz * ax - yz * ay
-    if not pivot > ROUNDING * abs(zz):
+    # The determinant, since a small minor has lost digits of the pivot.
+    if not minor * pivot > ROUNDING * xx * yy * abs(zz):
         return None
     z = (gz - xz * bx - yz * by) / pivot
     return bx - ax * z, by - ay * z, z
