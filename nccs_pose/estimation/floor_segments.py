@@ -41,7 +41,7 @@ _LEAST_PIXELS = 10
 # Of a large blob only some pixels are looked at; a few of them in a row are no line yet.
 _LEAST_SAMPLES = 8
 # Fewer than this to start from hardly ever grow to so many.
-_LEAST_START = 4
+_LEAST_START = 7
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8

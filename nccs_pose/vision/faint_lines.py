@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 
 import cv2
-from nccs_pose.vision.segment import Mask
+from nccs_pose.vision.segment import Mask, upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +61,7 @@ def faint_line_mask(feature: Mask, floor: Mask, gate: float, window: int) -> Mas
     np.clip(height, -most, most, out=height)
     shown, going_on = _ridges(height, max(round(_ASIDE * window), _LEAST_ASIDE))
     usual = shown[::_SPARSE, ::_SPARSE][sample]
-    middle = float(np.median(usual))
+    middle = upper_median(usual)
     least = middle + max(gate * _deviation(usual - middle), _ROUNDING[1])
     return cv2.bitwise_and(cv2.compare(going_on, least, cv2.CMP_GT), floor)
 
@@ -82,14 +82,14 @@ def _ridges(
         means = cv2.filter2D(wide, cv2.CV_32F, row, borderType=cv2.BORDER_REPLICATE)
         half, across = 0.5 * (_HALF + 1), aside / math.hypot(x, y)
         ahead, behind = (_moved(means, k * x, k * y, _HALF) for k in (half, -half))
-        both = ahead + behind
+        both = cv2.add(ahead, behind)
         here, one, other = (
             _moved(both, -k * y, k * x, aside) for k in (0.0, across, -across))
-        ridge = here - np.maximum(one, other)
-        np.maximum(best, ridge, out=best)
-        fainter = _moved(np.minimum(ahead, behind), 0.0, 0.0, aside)
-        ridge *= fainter > 0.5 * _GOES_ON * here
-        np.maximum(going_on, ridge, out=going_on)
+        ridge = cv2.subtract(here, cv2.max(one, other))
+        cv2.max(best, ridge, dst=best)
+        fainter = _moved(cv2.min(ahead, behind), 0.0, 0.0, aside)
+        goes_on = cv2.compare(fainter, cv2.multiply(here, 0.5 * _GOES_ON), cv2.CMP_GT)
+        cv2.max(going_on, cv2.copyTo(ridge, goes_on), dst=going_on)
     return 0.5 * best, 0.5 * going_on
 
 
@@ -116,4 +116,4 @@ _ROWS = tuple(_row(angle) for angle in (np.arange(_DIRECTIONS) * math.pi / _DIRE
 
 def _deviation(values: NDArray[np.float32]) -> float:
     """The standard deviation about zero of values (N,), those of things apart."""
-    return 1.4826 * float(np.median(np.abs(values)))
+    return 1.4826 * upper_median(np.abs(values))
