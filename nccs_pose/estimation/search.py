@@ -63,8 +63,9 @@ class Searcher:
     """Finds line-like strips in images and the poses that explain them, for one rig and map.
 
     :ivar first: the way to find the strips of an image that suffices for most.
-    :ivar further: ways for the others, in groups that belong together. Each look takes the strips
-        found before and what the tapes were thought to look like, and gives its own of both.
+    :ivar further: ways for the others, in groups that take turns from image to image. Each look
+        takes the strips found before and what the tapes were thought to look like, and gives its
+        own of both.
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
@@ -85,7 +86,8 @@ class Searcher:
         self._window = max(_LEAST_WINDOW, options.window // pitch)
         self.first: Look = self._first_look
         self.further: tuple[tuple[Look, ...], ...] = () if by_hsv else (
-            (self._look_by_example,), (self._look_along, self._look_along_by_example))
+            (self._look_by_example, self._look_along),
+            (self._look_along, self._look_along_by_example))
 
     def segments(self, image: NDArray[np.uint8]) -> Strips:
         """Straight strips of the map's colours on the floor, the largest first."""

@@ -85,17 +85,16 @@ def sights(
 
     What is given is to be tried before the next is asked for.
 
-    :param in_vain: how many images before this one were searched and showed nothing; then the
-        further looks take turns from image to image.
+    :param in_vain: how many images before this one were searched and showed nothing; the groups of
+        further looks take turns.
     :param told: where the robot is by something else than the image.
     :param lap: is told the name of each stage that ends.
     """
     groups = searcher.further
-    if in_vain and groups:
-        groups = groups[in_vain % len(groups):][:1]
+    further = groups[in_vain % len(groups)] if groups else ()
     best: Sight | None = None
     tried: list[Sight] = []
-    for look in (searcher.first, *(look for group in groups for look in group)):
+    for look in (searcher.first, *further):
         segments, shown = look(image, best.segments if best is not None else (), colours)
         if best is not None and segments is best.segments:
             continue
