@@ -20,11 +20,14 @@ from collections.abc import Callable
 from dataclasses import replace
 import itertools
 import math
+from typing import Any
 
+from nccs_pose.estimation.alignment import Aligner, Alignment
 from nccs_pose.estimation.association import map_symmetries
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
 from nccs_pose.simulation.renderer import render
@@ -252,6 +255,60 @@ def test_driving_along_a_wall_of_bays_takes_none_for_the_last() -> None:
         localiser.add_odometry((k + 1) * PERIOD_NS, pose)
         assert localiser.process((k + 1) * PERIOD_NS, render(scene, pose, rng)).pose is None
         pose = pose @ Pose2(0.7, 0.0, 0.02)
+
+
+@pytest.fixture
+def laid(monkeypatch: pytest.MonkeyPatch) -> list[Pose2]:
+    """The poses that are laid on images from here on."""
+    poses: list[Pose2] = []
+    align = Aligner.align
+
+    def noted(
+        aligner: Aligner, image: np.ndarray, start: Pose2, *rest: Any, **options: Any,
+    ) -> Alignment | None:
+        poses.append(start)
+        return align(aligner, image, start, *rest, **options)
+
+    monkeypatch.setattr(Aligner, 'align', noted)
+    return poses
+
+
+def test_where_many_places_look_the_same_one_of_them_is_laid_on_an_image(
+        laid: list[Pose2]) -> None:
+    scene, localiser = _hall_of_bays()
+    pose = Pose2(1.3, 2.0, 0.4)
+    for k in range(3):
+        laid.clear()
+        image = render(scene, pose, np.random.default_rng(k))
+        estimate = localiser.process((k + 1) * PERIOD_NS, image)
+        assert estimate.state is State.AMBIGUOUS
+        # What is not laid on the image is told as it was guessed.
+        assert any(np.abs(c.pose.minus(pose)).max() < 0.15 for c in estimate.candidates)
+        # From bay to bay the hall looks the same, either way round.
+        assert len(estimate.candidates) >= 20
+        assert len(laid) == 1
+
+
+def test_a_pose_that_holds_speaks_for_its_twins(laid: list[Pose2]) -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7))
+    for _ in range(3):
+        laid.clear()
+        estimate = drive.go(Pose2(0.1, 0.0, 0.2))
+        assert [c.score for c in estimate.candidates] == [estimate.candidates[0].score] * 2
+        assert len(laid) == 1
+
+
+def test_a_pose_that_is_refused_in_any_case_is_not_laid_to_the_end() -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 0.5))
+    aligner = Aligner(FloorTable(SCENE.rig, DEFAULTS.reach), SCENE.line_map, DEFAULTS)
+    image, start = drive.picture(), drive.pose @ Pose2(0.03, -0.03, 0.015)
+    settled = aligner.align(image, start, aligner.nominal_colours, reach=2.0)
+    asked: list[Alignment] = []
+    stopped = aligner.align(
+        image, start, aligner.nominal_colours, reach=2.0,
+        hopeless=lambda alignment: not asked.append(alignment))
+    assert settled is not None and stopped is asked[0] and len(asked) == 1
+    assert stopped.pose != settled.pose
 
 
 def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:

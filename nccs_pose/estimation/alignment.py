@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -37,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
-_SPACING = 2.0
+SPACING = 2.0
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
 # first, rough pass takes one station of so many; a search takes so many of each line, this far
 # apart (px) or more.
@@ -64,6 +65,8 @@ _LEAST_STATIONS = 12
 _LEAST_LENGTH = 192.0
 # Of a searched pose this part of what must be found at the end has to be found from the first.
 _HOPELESS = 0.8
+# A pass that moves no station further than this, px, shows the lines that the last will.
+_NEARLY = 1.0
 # A line of so many pixels of curve, so wide in the image (px), of which less than this fraction
 # is found, is missing.
 _PLAIN_LENGTH = 60.0
@@ -155,6 +158,7 @@ class Aligner:
         *,
         reach: float = 0.0,
         prior: tuple[Pose2, Array] | None = None,
+        hopeless: Callable[[Alignment], bool] | None = None,
     ) -> Alignment | None:
         """Lay a pose on the image from a start near it.
 
@@ -162,6 +166,8 @@ class Aligner:
         :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
             are searched first; 0 is for a start that is most likely right.
         :param prior: carries the directions that the lines in view do not fix.
+        :param hopeless: whether a pose that will not move any further is refused in any case: one
+            that is comes back as it is, before it has settled.
         :returns: None where too little of what the start predicts is found, or where the poses do
             not settle.
         """
@@ -171,7 +177,7 @@ class Aligner:
             if searched is None:
                 return None
             pose = searched
-        places = self._predictor.places(pose, _SPACING, self._options.stations)
+        places = self._predictor.places(pose, SPACING, self._options.stations)
         if len(places) < _LEAST_STATIONS:
             return None
         attitude = np.zeros(3)
@@ -188,7 +194,7 @@ class Aligner:
                 if rough.leant > _SETTLED_BLURS * sharpest:
                     attitude = rough.refinement.attitude
         result: Alignment | None = None
-        for _ in range(_ITERATIONS):
+        for k in range(_ITERATIONS):
             measured = self._measure(
                 image, places, pose, prior, colours, attitude, rough=False)
             if measured is None:
@@ -199,15 +205,18 @@ class Aligner:
                 return None
             step = result.pose.minus(pose)
             sharpest = min(colour.blur for colour in colours)
-            learned = max(abs(a.blur - b.blur) for a, b in zip(known, colours))
-            settled = learned < _LEARNED_BLUR and (
+            steady = max(abs(a.blur - b.blur) for a, b in zip(known, colours)) < _LEARNED_BLUR
+            settled = steady and (
                 measured.moved < _SETTLED_BLURS * sharpest or close(
                     result.pose, pose, result.covariance, _SETTLED))
+            # The first pass learns what tapes look like, and may miss what the next one finds.
+            if hopeless is not None and k > 0 and steady and measured.moved < _NEARLY:
+                settled = settled or hopeless(result)
             pose, attitude = result.pose, result.refinement.attitude
             if settled:
                 return result
             if measured.moved > _MOVED_PX:
-                places = self._predictor.places(pose, _SPACING, self._options.stations)
+                places = self._predictor.places(pose, SPACING, self._options.stations)
         if result is None or np.abs(step).max() > _LAST_STEP:
             return None
         # Stations that come and go near their thresholds can keep it stepping to and fro.

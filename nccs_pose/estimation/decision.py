@@ -67,8 +67,11 @@ def left_open(
     :returns: those to be laid on the next image, and others that may be right as well.
     """
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
+    # What is left open shows so much of what the best does, in the images before as well.
+    before = best.mean / held[0].score
     others = sorted(
-        (*others, *(Hypothesis(c.pose, (c.score,)) for c in sifted.open)), key=lambda h: -h.mean)
+        (*others, *(Hypothesis(c.pose, (before * c.score,)) for c in sifted.open)),
+        key=lambda h: -h.mean)
     carried_on = (best, *others[:_CARRIED - 1])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Set
 from dataclasses import dataclass
 
-from nccs_pose.estimation.alignment import Alignment, close
+from nccs_pose.estimation.alignment import Alignment, close, SPACING
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.misplaced import placement, plainly_in_place
@@ -141,6 +141,13 @@ class Judge:
                    or contradiction(alignment, segments, self._map))
         if against is not None:
             return against
+        return self.by_strips(alignment, segments, expected=expected, strips=strips)
+
+    def by_strips(
+        self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
+        strips: FittedCandidate | None = None,
+    ) -> Found | Objection:
+        """Judge a pose against which the image itself says nothing; see :meth:`found`."""
         found = self.measured(alignment, segments, strips)
         if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
             return Objection('the lines that it rests on do not fix a pose')
@@ -148,9 +155,16 @@ class Judge:
         weaker, stronger = sorted((found.claimed, alignment.explained))
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
-            return Objection(
-                f'it rests on {used} lines and leaves too much unexplained', hidden=True)
+            return _unexplained(used)
         return found
+
+    def beforehand(self, strips: FittedCandidate) -> Objection | None:
+        """What strips alone say against a pose that nothing expects; None if nothing."""
+        if strips.claimed >= _MOST:
+            return None
+        places = self._predictor.places(strips.pose, SPACING, self._options.stations)
+        seen = len(np.unique(places.number))
+        return _unexplained(seen) if seen < 3 else None
 
     def measured(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...],
@@ -163,6 +177,10 @@ class Judge:
             alignment, claimed, float(np.sqrt(score * alignment.explained)) * fit_of(
                 float(np.mean(alignment.points.sigma**2))),
             score)
+
+
+def _unexplained(lines: int) -> Objection:
+    return Objection(f'it rests on {lines} lines and leaves too much unexplained', hidden=True)
 
 
 def fit_of(square: float) -> float:

@@ -44,7 +44,7 @@ from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Pred
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.sifting import Refused, Sifter
+from nccs_pose.estimation.sifting import Case, Refused, Sifter
 from nccs_pose.estimation.sights import sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.told import Told
@@ -189,7 +189,8 @@ class Localiser:
         for sight in sights(
                 image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
             segments = sight.segments
-            sifted = self._sifter.sift(sight, hypotheses, self._doubts, prediction, told)
+            sifted = self._sifter.sift(
+                Case(sight, self._doubts, prediction, told, refusals), hypotheses)
             watch.lap('measure')
             refusals += sifted.refused
             # What was tried early is no place to be alone in.

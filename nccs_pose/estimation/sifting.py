@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
+from itertools import islice
 import math
 
 from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
@@ -29,7 +30,7 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.sights import ALL_STRIPS, Sight
 from nccs_pose.estimation.told import Told
-from nccs_pose.estimation.verdict import Objection
+from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
@@ -103,6 +104,26 @@ class _Start:
         return self.strips if near else None
 
 
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A look at an image, and what else is known when poses are judged by it.
+
+    :ivar sight: what the look shows.
+    :ivar doubts: lines that were seen beside their place and not in it since.
+    :ivar prediction: of the pose, if there is one.
+    :ivar told: where the robot is by something else than the image, which can decide between
+        equal poses: those that are there come first. Without it two equal poses are enough to
+        know that the image does not decide, and no more are laid on it.
+    :ivar before: what was refused at other looks at the same image.
+    """
+
+    sight: Sight
+    doubts: Set[int]
+    prediction: Prediction | None
+    told: Told | None
+    before: Sequence[Refused]
+
+
 class Sifter:
     """Lays poses on images of one rig and map."""
 
@@ -119,17 +140,9 @@ class Sifter:
         self._symmetries = symmetries
         self._options = options
 
-    def sift(
-        self, sight: Sight, hypotheses: tuple[Hypothesis, ...], doubts: Set[int],
-        prediction: Prediction | None, told: Told | None,
-    ) -> Sifted:
-        """Lay hypotheses, the best candidates and their twins on an image.
-
-        :param doubts: lines that were seen beside their place and not in it since.
-        :param told: where the robot is by something else than the image, which can decide between
-            equal poses: those that are there come first. Without it two equal poses are enough to
-            know that the image does not decide, and of the others only hypotheses are laid on it.
-        """
+    def sift(self, case: Case, hypotheses: tuple[Hypothesis, ...]) -> Sifted:
+        """Lay hypotheses, the best candidates and their twins on an image."""
+        sight, told = case.sight, case.told
         options = self._options
         candidates = sight.candidates
         if told is not None and len(candidates) > _TRIED:
@@ -137,44 +150,73 @@ class Sifter:
         starts = [_Start(h.pose, options.band) for h in hypotheses]
         starts += [_Start.of(c) for c in candidates[:_TRIED]
                    if c.score >= _WORTH_TRYING * sight.promise]
-        left = [_Start.of(c) for c in candidates[_TRIED:]]
+        left = list(candidates[_TRIED:])
         sifted = Sifted([], [], [], [])
         doubtful: list[Found] = []
+        equal: list[Pose2] = []
         seen: list[Pose2] = []
+        # An image shows of these what it showed of the pose whose twins they are.
+        twins: list[Pose2] = []
         best: tuple[_Start, Found] | None = None
+        undecided = False
         for start in starts:
+            if any(same_pose(start.pose, pose) for pose in (*seen, *twins)):
+                continue
+            if undecided:
+                # What the image shows of the hypotheses is among the candidates.
+                left += [start.strips] if start.strips is not None else []
+                continue
             if best is not None and not self._rivals(start, *best):
                 continue
-            if any(same_pose(start.pose, pose) for pose in seen):
-                continue
-            if told is None and start.strips is not None and len(
-                    self._equals(sifted.held)) > 1:
-                left.append(start)
-                continue
-            verdict = self._verdict(sight, start, doubts, prediction, seen)
+            if case.prediction is None and start.strips is not None:
+                against = self._judge.beforehand(start.strips)
+                if against is not None:
+                    sifted.refused.append(Refused(against))
+                    sifted.hidden.append(Candidate(start.pose, start.strips.score))
+                    continue
+            verdict = self._again(case, start) or self._verdict(case, start, seen)
+            pose = start.pose if verdict is None else verdict[0].pose
+            own = [s @ pose for s in self._symmetries]
+            if told is None and (verdict is None or verdict[1] is not _DOUBTFUL):
+                twins += own
             if verdict is None:
                 continue
             alignment, found = verdict
-            seen.append(alignment.pose)
+            seen.append(pose)
             if isinstance(found, Objection):
                 sifted.refused.append(Refused(found, alignment))
                 if found is _DOUBTFUL:
                     doubtful.append(self._measured(sight, start, alignment))
                 elif found.hidden:
                     shown = self._measured(sight, start, alignment)
-                    sifted.hidden.append(Candidate(alignment.pose, shown.by_strips))
+                    alike = (pose, *own) if told is None else (pose,)
+                    sifted.hidden.extend(Candidate(p, shown.by_strips) for p in alike)
                 continue
             sifted.held.append(found)
-            # On the image the twins of what holds are what it is itself.
-            for twin in (_Start(s @ alignment.pose, _SEARCH_BAND) for s in self._symmetries):
-                there = told is not None and told.holds(twin.pose)
-                (starts if there else left).append(twin)
+            for twin in own:
+                if told is not None and told.holds(twin):
+                    starts.append(_Start(twin, _SEARCH_BAND))
+                else:
+                    equal.append(twin)
             if best is None or found.score > best[1].score:
                 best = start, found
+            undecided = told is None and (
+                len(self._equals(sifted.held)) * (1 + len(self._symmetries)) > 1
+                or self._is_repeated(best[1], candidates))
         sifted.held.sort(key=lambda f: -f.score)
         if best is not None:
-            self._leave_open(sifted, best[1], left, doubtful, seen)
+            self._leave_open(sifted, best[1], left, equal, doubtful, seen)
         return sifted
+
+    def _is_repeated(self, held: Found, candidates: Sequence[FittedCandidate]) -> bool:
+        """Whether more places than are laid on an image show as much as one that holds.
+
+        Then it decides nothing, and those that it shows are all among the candidates.
+        """
+        least = self._options.ambiguity_ratio * held.by_strips
+        equal = (c for c in candidates
+                 if c.score >= least and not same_pose(c.pose, held.alignment.pose))
+        return len(list(islice(equal, _TRIED + 1))) > _TRIED
 
     def _equals(self, found: list[Found]) -> list[Found]:
         """Those of some poses that explain an image about as well as the best of them."""
@@ -182,12 +224,13 @@ class Sifter:
         return [f for f in found if f.score >= self._options.ambiguity_ratio * most]
 
     def _leave_open(
-        self, sifted: Sifted, best: Found, left: list[_Start], doubtful: list[Found],
-        seen: list[Pose2],
+        self, sifted: Sifted, best: Found, left: list[FittedCandidate], equal: list[Pose2],
+        doubtful: list[Found], seen: list[Pose2],
     ) -> None:
         """Add the poses that are left open, beside the best that holds, and what may be hidden.
 
-        :param left: what was not laid on the image.
+        :param left: candidates that were not laid on the image.
+        :param equal: twins of what holds that were not.
         :param doubtful: what was, and shows about as much as another pose.
         :param seen: all that was laid on the image.
         """
@@ -200,65 +243,93 @@ class Sifter:
                 sifted.hidden.append(Candidate(pose, found.by_strips))
         # A twin shows what the pose that holds does, even if it was laid on the image and refused.
         twins, seen = [found.alignment.pose for found in sifted.held], list(seen)
-        for start in (start for start in left if start.strips is None):
-            if not any(same_pose(start.pose, pose) for pose in twins):
-                twins.append(start.pose)
-                sifted.open.append(Candidate(start.pose, best.score))
+        for pose in equal:
+            if not any(same_pose(pose, twin) for twin in twins):
+                twins.append(pose)
+                sifted.open.append(Candidate(pose, best.score))
         seen += twins
         # Candidates differ among themselves.
-        for strips in (start.strips for start in left if start.strips is not None):
+        for strips in left:
             share = min(strips.score / best.by_strips, 1.0)
             if share >= ratio and not any(same_pose(strips.pose, pose) for pose in seen):
                 sifted.open.append(Candidate(strips.pose, share * best.score))
         sifted.open.sort(key=lambda candidate: -candidate.score)
 
     def _verdict(
-        self, sight: Sight, start: _Start, doubts: Set[int], prediction: Prediction | None,
-        seen: list[Pose2],
+        self, case: Case, start: _Start, seen: list[Pose2],
     ) -> tuple[Alignment, Found | Objection] | None:
         """Lay a pose on the image, and judge it; None where it does not lie, or was seen before.
 
         Its surroundings are searched only where it does not fit, or where a line that it misses
         may be there.
         """
-        verdict = None
+        sight, verdict = case.sight, None
         for reach in (LINEAR_PX, start.reach):
             if reach == LINEAR_PX and start.misfit >= LINEAR_PX:
                 continue
             alignment = self._aligner.align(
-                sight.image, start.pose, sight.colours, reach=reach)
+                sight.image, start.pose, sight.colours, reach=reach,
+                hopeless=misses_lines if case.prediction is None else None)
             if alignment is None:
                 continue
             if any(same_pose(alignment.pose, pose) for pose in seen):
                 return verdict
-            expected = is_expected(alignment, prediction, self._options.innovation_gate)
+            expected = self._expected(case, alignment)
             found = self._judge.found(
-                sight.image, alignment, sight.segments, doubts, expected=expected,
+                sight.image, alignment, sight.segments, case.doubts, expected=expected,
                 strips=start.kept(alignment.pose))
-            if isinstance(found, Found) and not expected and self._doubtful(found, sight):
-                found = _DOUBTFUL
-            verdict = alignment, found
-            if isinstance(found, Found) or not alignment.missing:
+            verdict = alignment, self._unless_doubtful(case, found, expected)
+            if isinstance(verdict[1], Found) or not alignment.missing:
                 break
         return verdict
+
+    def _again(self, case: Case, start: _Start) -> tuple[Alignment, Found | Objection] | None:
+        """Judge a pose that was laid on the image at another look by what is new at this one.
+
+        None where it was not, or where other colours may show lines that it missed.
+        """
+        for refused in case.before:
+            alignment, against = refused.alignment, refused.objection
+            if alignment is None or against is None or alignment.missing or not same_pose(
+                    start.pose, alignment.pose):
+                continue
+            if not against.hidden:
+                return alignment, against
+            expected = self._expected(case, alignment)
+            found = self._judge.by_strips(
+                alignment, case.sight.segments, expected=expected,
+                strips=start.kept(alignment.pose))
+            return alignment, self._unless_doubtful(case, found, expected)
+        return None
+
+    def _expected(self, case: Case, alignment: Alignment) -> bool:
+        return is_expected(alignment, case.prediction, self._options.innovation_gate)
 
     def _measured(self, sight: Sight, start: _Start, alignment: Alignment) -> Found:
         """How much a pose explains that was refused."""
         return self._judge.measured(alignment, sight.segments, start.kept(alignment.pose))
 
-    def _doubtful(self, found: Found, sight: Sight) -> bool:
-        """Whether the strips speak as much for another pose, and the image for neither.
+    def _unless_doubtful(
+        self, case: Case, found: Found | Objection, expected: bool,
+    ) -> Found | Objection:
+        """A verdict, unless the strips speak as much for another pose, and the image for neither.
 
         An image so coarse that lines lie badly on it is no verdict on another pose: the right one
-        may not be laid on it at all, and the next may be.
+        may not be laid on it at all, and the next may be. Where it decides nothing there is no
+        doubt.
         """
-        alignment = found.alignment
+        if isinstance(found, Objection) or expected:
+            return found
+        alignment, candidates = found.alignment, case.sight.candidates
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
         if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
-            return False
+            return found
+        if case.told is None and self._is_repeated(found, candidates):
+            return found
         least = self._options.ambiguity_ratio * found.by_strips
-        return any(c.score >= least and not same_pose(c.pose, alignment.pose)
-                   for c in sight.candidates)
+        rivals = any(c.score >= least and not same_pose(c.pose, alignment.pose)
+                     for c in candidates)
+        return _DOUBTFUL if rivals else found
 
     def _rivals(self, start: _Start, held_from: _Start, held: Found) -> bool:
         """Whether what a pose shows on the strips leaves it a chance against one that holds.

@@ -91,11 +91,16 @@ def objection(
         return Objection(
             f'the {used} lines that it rests on lie {size:.1f} px off, where the noise of the '
             f'image makes {size / scale:.2f} px')
-    if used < 3 and alignment.missing and not expected:
+    if misses_lines(alignment) and not expected:
         return Objection(
             f'it rests on {used} lines and {len(alignment.missing)} more should be in view',
             hidden=True)
     return None
+
+
+def misses_lines(alignment: Alignment) -> bool:
+    """Whether a pose rests on two lines, and there is more to see that is not there."""
+    return bool(alignment.missing) and lines_used(alignment) < 3
 
 
 def is_weak(alignment: Alignment) -> bool:
