@@ -439,6 +439,24 @@ def test_a_blob_over_a_whole_court_is_split_into_its_lines(table: FloorTable) ->
     assert others <= 5
 
 
+@pytest.mark.parametrize('n', [4, 6])
+def test_a_blob_over_tapes_that_all_cross_is_split_into_them(n: int, table: FloorTable) -> None:
+    rng = np.random.default_rng(3)
+    found, others = 0, 0
+    for _ in range(6):
+        angles = (np.arange(n) + rng.uniform(-0.25, 0.25, n)) * np.pi / n
+        along = np.column_stack([np.cos(angles), np.sin(angles)])
+        middle = np.array([0.0, 1.1]) + 0.2 * rng.uniform(-1.0, 1.0, (n, 2))
+        tapes = LineMap(tuple(
+            _line(tuple(m - 0.8 * d), tuple(m + 0.8 * d)) for m, d in zip(middle, along)))
+        strips = _segments(tapes, HERE, table)
+        on = [sum(_lies_on(s, line, HERE) < 0.08 for s in strips) for line in tapes]
+        found += sum(k > 0 for k in on)
+        others += len(strips) - sum(on)
+    assert found >= 6 * n - 4
+    assert others <= 1
+
+
 def test_a_tape_cut_in_pieces_is_joined(table: FloorTable) -> None:
     whole = LineMap((_line((-1.2, 0.9), (1.2, 0.9)), _line((-1.2, -3.9), (1.2, -3.9))))
     pixels, _ = RIG.project(np.array([[*HERE.inverse().apply(np.array([0.0, 0.9])), 0.0]]))

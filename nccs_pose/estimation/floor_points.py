@@ -42,6 +42,7 @@ class FloorPoints:
     :ivar precision: weight in a fit (P,): far pixels cover much floor and say little.
     :ivar blob: of each (P,), ascending.
     :ivar weight: how many pixels each stands for (P,).
+    :ivar pitch: side of their pixels, px of the image.
     """
 
     floor: Array
@@ -49,11 +50,12 @@ class FloorPoints:
     precision: Array
     blob: NDArray[np.intp]
     weight: Array
+    pitch: int
 
     def __getitem__(self, index: NDArray[np.intp] | slice) -> FloorPoints:
         return FloorPoints(
             self.floor[index], self.spread[index], self.precision[index], self.blob[index],
-            self.weight[index])
+            self.weight[index], self.pitch)
 
     @cached_property
     def moments(self) -> Array:
@@ -67,6 +69,11 @@ class FloorPoints:
         moments[:, 4] = moments[:, 1] * y
         moments[:, 5] = moments[:, 2] * y
         return moments
+
+    @cached_property
+    def apart(self) -> Array:
+        """How far points are from those next to them (P,), metres: some pixels are left out."""
+        return np.sqrt(self.weight * (self.spread[:, 0] + self.spread[:, 2])) / self.pitch
 
     def near(self, normals: Array, offsets: Array, width: float) -> NDArray[np.float32]:
         """1 where a point may be one of a tape's along each of C lines (P, C), else 0."""
@@ -107,7 +114,8 @@ class PixelFloor:
         floor[:, :2] = found[:, :2]
         spread = found[:, 2:]
         precision = 1.0 / (spread[:, 0] + spread[:, 2] + 0.1 * width**2)
-        return FloorPoints(floor, spread, precision, segmentation.label, segmentation.weight)
+        return FloorPoints(
+            floor, spread, precision, segmentation.label, segmentation.weight, segmentation.pitch)
 
 
 @dataclass(frozen=True)
@@ -156,7 +164,7 @@ class FloorLine:
         """
         c, s = math.cos(self.angle), math.sin(self.angle)
         along, off = np.array([[c, s, 0.0], [-s, c, -self.offset]]) @ points.floor.T
-        return along, np.abs(off) - (_FOOTPRINT * self.footprint(points.spread) + _half(width))
+        return along, np.abs(off) - half_strip(width, self.footprint(points.spread))
 
 
 def misplaced(points: FloorPoints, normals: Array, offsets: Array, width: float) -> Array:
@@ -167,7 +175,12 @@ def misplaced(points: FloorPoints, normals: Array, offsets: Array, width: float)
     """
     off = np.einsum('pi,pi->p', points.floor[:, :2], normals) - offsets
     square = np.einsum('pi,pi->p', points.spread, squares(normals) * [1.0, 2.0, 1.0])
-    return np.abs(off) > _FOOTPRINT * np.sqrt(square) + _half(width)
+    return np.abs(off) > half_strip(width, np.sqrt(square))
+
+
+def half_strip(width: float, footprint: Array) -> Array:
+    """How far from a tape's midline pixels of footprints (N,) across it may be, metres (N,)."""
+    return _FOOTPRINT * footprint + _half(width)
 
 
 def _half(width: float) -> float:
@@ -181,14 +194,16 @@ def squares(points: Array) -> Array:
     return np.stack([x * x, x * y, y * y], axis=1)
 
 
-def principal_lines(moments: Array) -> tuple[Array, Array]:
-    """Total least squares lines: unit normals (K, 2) and offsets (K,).
+def principal_lines(moments: Array) -> tuple[Array, Array, Array]:
+    """Total least squares lines.
 
     :param moments: summed over each one's points (K, 6); see :attr:`FloorPoints.moments`.
+    :returns: unit normals (K, 2), offsets (K,) and the points' mean square distances (K,), m^2.
     """
     mean = moments[:, 1:3] / moments[:, :1]
     xx, xy, yy = (moments[:, 3:] - moments[:, :1] * squares(mean)).T
     # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    return normal, np.einsum('ki,ki->k', normal, mean)
+    minor = 0.5 * (xx + yy - np.hypot(2.0 * xy, xx - yy)) / moments[:, 0]
+    return normal, np.einsum('ki,ki->k', normal, mean), minor

@@ -27,6 +27,7 @@ import math
 from nccs_pose.estimation.floor_points import (
     FloorLine,
     FloorPoints,
+    half_strip,
     misplaced,
     PixelFloor,
     principal_lines,
@@ -48,9 +49,10 @@ _LONGEST_GAP = 0.8
 # So much longer than the longest tape they are several in a row, this far apart, metres.
 _TOO_LONG = 1.1
 _ROW_GAP = 0.12
-# Something this close beside a strip, metres, makes it part of a larger thing.
-_BESIDE = 0.15
-# So much beside a strip, of what lies in it, is no crossing tape any more.
+# Where something is this close beside a strip, metres, it does not stand free. If more than this
+# part of what lies in the strip is there, the strip is part of a larger thing, unless it stands
+# free for so long as a line has to be.
+_BESIDE = 0.05
 _MOST_BESIDE = 0.35
 # A blob is a single line when no more than this part of it lies beside; of one that is, every
 # so many-th pixel is enough.
@@ -60,12 +62,15 @@ _THINNED = 4
 _SHORT = 60
 _LEAST_LINE = 3
 # Of one that is not, lines are drawn through so many of its pixels and their neighbours within
-# this distance (m, and footprints), and through as many pairs of its pixels; all such blobs have
-# so many of these lines together, and so many pixels.
-_SEEDS = 24
-_NEIGHBOURS = (0.35, 4.0)
-_MOST_SEEDS = 96
+# this distance (m, and footprints) where these make a strip; all such blobs have so many of these
+# lines together, and so many pixels.
+_SEEDS = 96
+_NEIGHBOURS = (0.1, 3.0)
+_MOST_SEEDS = 288
 _MOST_PIXELS = 2000
+# The mean square distance from its middle is a third of the square of half of its width where a
+# strip is full, and more at a corner.
+_STRAIGHT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +142,7 @@ def floor_segments(
             continue
         futile.clear()
         line, along, inside, beside = found
-        if points.weight[beside].sum() < _MOST_BESIDE * points.weight[inside].sum():
+        if _stands_free(points, along, inside, beside, width):
             inside = _one_tape(points, along, inside, longest)
             run = along[inside]
             ends = line.at(run.min()), line.at(run.max())
@@ -167,7 +172,7 @@ def _candidates(
     first = np.flatnonzero(begins)
     number = np.cumsum(begins) - 1
     size = np.bincount(number)
-    own, own_offset = principal_lines(np.add.reduceat(points.moments, first))
+    own, own_offset, _ = principal_lines(np.add.reduceat(points.moments, first))
     off = misplaced(points, own[number], own_offset[number], width)
     misfit = np.add.reduceat(off.astype(float), first) / size
     speck = size < _LEAST_LINE
@@ -177,35 +182,24 @@ def _candidates(
     stride = np.where(tangled, step, np.where(size < _SHORT, 1, _THINNED))
     kept = ((np.arange(len(number)) - first[number]) % stride[number] == 0) & ~speck[number]
     lines = [(own[~speck], own_offset[~speck])]
-    if count > 0:
-        rng, seeds = np.random.default_rng(0), max(1, min(_SEEDS, _MOST_SEEDS // count))
+    seeds = max(1, min(_SEEDS, _MOST_SEEDS // max(count, 1)))
     for k in np.flatnonzero(tangled).tolist():
-        part = points[first[k]:first[k] + size[k]:step]
-        lines += [_through_neighbours(part, seeds), _through_pairs(part, rng, seeds)]
+        lines.append(_through_neighbours(points[first[k]:first[k] + size[k]:step], seeds, width))
     normals, offsets = (np.concatenate(parts) for parts in zip(*lines))
     return normals, offsets, np.flatnonzero(kept)
 
 
-def _through_neighbours(part: FloorPoints, seeds: int) -> tuple[Array, Array]:
-    """Lines through some pixels of a blob and what surrounds each: right but for its corners."""
+def _through_neighbours(part: FloorPoints, seeds: int, width: float) -> tuple[Array, Array]:
+    """Lines through some pixels of a blob and what surrounds each, but for where tapes meet."""
     seed = np.arange(0, len(part.floor), max(1, len(part.floor) // seeds))
     footprint = np.sqrt(0.5 * (part.spread[seed, 0] + part.spread[seed, 2]))
     reach = _NEIGHBOURS[0] + _NEIGHBOURS[1] * footprint
     x, y, _ = part.floor.T
     near = np.square(x - x[seed, None]) + np.square(y - y[seed, None]) < np.square(reach)[:, None]
-    return principal_lines(near[near.sum(axis=1) >= _LEAST_LINE] @ part.moments)
-
-
-def _through_pairs(
-    part: FloorPoints, rng: np.random.Generator, seeds: int,
-) -> tuple[Array, Array]:
-    """Lines through random pairs of a blob's pixels."""
-    pair = part.floor[rng.integers(0, len(part.floor), (seeds, 2)), :2]
-    along = pair[:, 1] - pair[:, 0]
-    length = np.hypot(along[:, 0], along[:, 1])
-    pair, along = pair[length > 0.1], along[length > 0.1] / length[length > 0.1, None]
-    across = np.column_stack([-along[:, 1], along[:, 0]])
-    return across, np.einsum('ni,ni->n', across, pair[:, 0])
+    enough = near.sum(axis=1) >= _LEAST_LINE
+    normals, offsets, square = principal_lines(near[enough] @ part.moments)
+    strip = square < _STRAIGHT * np.square(half_strip(width, footprint[enough]))
+    return normals[strip], offsets[strip]
 
 
 def _strip(
@@ -232,12 +226,37 @@ def _strip(
     if high - low < _LEAST_LENGTH:
         return None
     # Only what hangs together with the strip counts: another tape may well cross it.
-    beside = np.flatnonzero((beyond > 0.0) & (beyond < _BESIDE) & (along > low) & (along < high))
+    beside = np.flatnonzero(
+        (beyond > 0.0) & (beyond < _BESIDE + points.apart) & (along > low) & (along < high))
     if len(beside) > 0:
         own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
         own[points.blob[inside]] = True
         beside = beside[own[points.blob[beside]]]
     return line, along, inside, beside
+
+
+def _stands_free(
+    points: FloorPoints, along: Array, inside: NDArray[np.intp], beside: NDArray[np.intp],
+    width: float,
+) -> bool:
+    """Whether a strip has little beside it, or nothing for so long as a line has to be.
+
+    Other tapes that cross it, however many, leave it free between them; a solid does not.
+
+    :param along: the strip's direction, of all points (P,), metres.
+    :param inside: its points.
+    :param beside: those beside it.
+    """
+    weight = points.weight[inside]
+    if points.weight[beside].sum() <= _MOST_BESIDE * weight.sum():
+        return True
+    place, others = along[inside], np.sort(along[beside])
+    after = np.searchsorted(others, place)
+    nearest = np.minimum(
+        np.abs(place - others.take(after, mode='clip')),
+        np.abs(place - others.take(after - 1, mode='clip')))
+    free = nearest > half_strip(width, points.apart[inside])
+    return bool(weight[free].sum() * np.ptp(place) > _LEAST_LENGTH * weight.sum())
 
 
 def _one_tape(
