@@ -364,6 +364,18 @@ def _mask(image: np.ndarray, colour: str = 'green') -> np.ndarray:
     return chromatic_mask(image, colour, 4.5, 0.05, 31)
 
 
+def test_the_floor_beside_a_dark_thing_is_not_white_and_a_tape_there_is() -> None:
+    image = np.full((240, 320, 3), 150, np.uint8)
+    cv2.circle(image, (100, 120), 40, (20, 20, 20), -1)
+    cv2.line(image, (60, 200), (260, 180), (200, 200, 200), 5)
+    image = cv2.add(image, np.random.default_rng(0).integers(0, 4, image.shape, dtype=np.uint8))
+    mask = _mask(image, 'white')
+    tape = np.zeros(mask.shape, np.uint8)
+    cv2.line(tape, (60, 200), (260, 180), 255, 5)
+    assert np.count_nonzero(mask[tape > 0]) > 0.9 * np.count_nonzero(tape)
+    assert np.count_nonzero(mask[cv2.dilate(tape, np.ones((3, 3), np.uint8)) == 0]) == 0
+
+
 @pytest.mark.parametrize('angle', [0.0, 0.1, -0.35])
 @pytest.mark.parametrize('half_width', [0.4, 0.5, 1.0])
 def test_tapes_a_pixel_wide_survive(half_width: float, angle: float) -> None:

@@ -39,6 +39,10 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
 # A pixel of a tape has this part of the highest contrast so near.
 _PART_OF_PEAK = 0.45
 _NEAR_PEAK = np.ones((5, 5), np.uint8)
+# No tape is so wide that a square of this part of its surroundings' width, and of so many pixels,
+# fits in it.
+_SQUARE = 0.4
+_LEAST_SQUARE = 7
 # Blobs with a shorter outline are noise, px; one of a smaller image may be so short.
 _SMALLEST = 8
 _SMALLEST_REDUCED = 5
@@ -102,14 +106,20 @@ def raised_mask(
     :param bright: brightness of the image, grey levels.
     """
     feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
-    around = cv2.blur(feature, (window, window))
-    noise = 1.4826 * upper_median(cv2.absdiff(feature[::4, ::4].copy(), around[::4, ::4].copy()))
+    # Beside a dark thing the floor stands out of the mean of both, but to one side only: a square
+    # fits in there. It does in a solid as well, which has to stay one.
+    usual = upper_median(feature[::8, ::8])
+    side = max(_LEAST_SQUARE, round(_SQUARE * window)) | 1
+    opened = cv2.morphologyEx(feature, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
+    around = cv2.max(cv2.blur(feature, (window, window)), cv2.min(opened, usual))
+    some = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
+    noise = 1.4826 * upper_median(np.abs(some - int(upper_median(some))))
     threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
     # whole.
-    height = cv2.subtract(feature, upper_median(feature[::8, ::8]))
+    height = cv2.subtract(feature, usual)
     peak = cv2.convertScaleAbs(
         cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
