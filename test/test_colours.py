@@ -37,8 +37,8 @@ LIGHTS = {
 MIXED = ('white', 'red', 'blue', 'yellow')
 
 
-def _scene(colours: tuple[str, ...], floor: str, light: str) -> Scene:
-    scene = arena_scene(640)
+def _scene(colours: tuple[str, ...], floor: str, light: str, width: int = 640) -> Scene:
+    scene = arena_scene(width)
     balance, stops = LIGHTS[light]
     return dataclasses.replace(
         scene,
@@ -88,6 +88,13 @@ def test_tapes_of_nearly_the_floors_colour_are_found_where_there_is_light(
     scene = _scene(colours, floor, light)
     localiser = Localiser(scene.rig, scene.line_map)
     assert sum(_found(localiser, scene, k) for k in range(10)) >= 9
+
+
+@pytest.mark.parametrize('k', [0, 13])
+def test_an_image_so_small_that_one_tape_alone_is_wide_gives_no_other_place(k: int) -> None:
+    # Turned by half the arena is almost itself, and tapes of half a pixel lie on what is near.
+    scene = _scene(('green',) * 4, 'grey', 'neutral', 320)
+    _found(Localiser(scene.rig, scene.line_map), scene, k)
 
 
 @pytest.mark.parametrize('light', ['dim', 'bright', 'warm', 'cold'])

@@ -89,6 +89,7 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
+    :ivar width: mean width of each line's stations in the image (L,), px; NaN likewise.
     :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
     """
@@ -103,6 +104,7 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
+    width: Array
     misfit: float
     colours: tuple[LineColour, ...]
 
@@ -314,12 +316,14 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     misfit = common_misfit(
         np.add.reduceat(residual, first) / np.sqrt(members), together, label.take(first))
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
+    in_view = np.where(seen > 0, seen, np.nan)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(there.nonzero()[0].tolist()), _missing(bands, index),
-        there / np.where(seen > 0, seen, np.nan), misfit, measured.colours)
+        there / in_view, 2.0 * np.bincount(bands.label, bands.half_width, lines) / in_view, misfit,
+        measured.colours)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:

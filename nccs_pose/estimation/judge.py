@@ -51,6 +51,9 @@ _BEYOND_DOUBT = 4
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
 # what is seen, one on three lines that of either; more lines speak for themselves.
 _MOST = 0.85
+# Out of nothing a pose must rest on two lines that are so wide in the image, px: thinner ones are
+# found on whatever is near, as the floor's edge.
+_BROAD = 0.6
 # Residuals of this root mean square count half, px.
 _HALF_AS_GOOD = 1.0
 # A pose that rests on three lines and explains this part of the image explains nearly all.
@@ -156,6 +159,11 @@ class Judge:
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
             return _unexplained(used)
+        broad = (alignment.support >= _WEAK) & (alignment.width >= _BROAD)
+        if not expected and np.count_nonzero(broad) < 2:
+            return Objection(
+                f'all but {np.count_nonzero(broad)} of the lines that it rests on are thinner '
+                f'than {_BROAD} px', hidden=True)
         return found
 
     def beforehand(self, strips: FittedCandidate) -> Objection | None:
