@@ -162,11 +162,11 @@ class Sifter:
         for start in starts:
             if any(same_pose(start.pose, pose) for pose in (*seen, *twins)):
                 continue
+            if best is not None and not self._rivals(start, *best):
+                continue
             if undecided:
                 # What the image shows of the hypotheses is among the candidates.
                 left += [start.strips] if start.strips is not None else []
-                continue
-            if best is not None and not self._rivals(start, *best):
                 continue
             if case.prediction is None and start.strips is not None:
                 against = self._judge.beforehand(start.strips)
@@ -201,8 +201,7 @@ class Sifter:
             if best is None or found.score > best[1].score:
                 best = start, found
             undecided = told is None and (
-                len(self._equals(sifted.held)) * (1 + len(self._symmetries)) > 1
-                or self._is_repeated(best[1], candidates))
+                len(self._equals(sifted.held)) > 1 or self._is_repeated(best[1], candidates))
         sifted.held.sort(key=lambda f: -f.score)
         if best is not None:
             self._leave_open(sifted, best[1], left, equal, doubtful, seen)
