@@ -140,17 +140,17 @@ class Judge:
 
         :param strips: what these say of it, if that is known.
         """
-        against = (self.objection(image, alignment, doubts, expected=expected)
-                   or contradiction(alignment, segments, self._map))
-        if against is not None:
-            return against
-        return self.by_strips(alignment, segments, expected=expected, strips=strips)
+        return self.objection(image, alignment, doubts, expected=expected) or self.by_strips(
+            alignment, segments, expected=expected, strips=strips)
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
         strips: FittedCandidate | None = None,
     ) -> Found | Objection:
         """Judge a pose against which the image itself says nothing; see :meth:`found`."""
+        against = contradiction(alignment, segments, self._map)
+        if against is not None:
+            return against
         found = self.measured(alignment, segments, strips)
         if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
             return Objection('the lines that it rests on do not fix a pose')
