@@ -182,19 +182,10 @@ class Aligner:
         places = self._predictor.places(pose, SPACING, self._options.stations)
         if len(places) < _LEAST_STATIONS:
             return None
-        attitude = np.zeros(3)
-        sharpest = min(colour.blur for colour in colours)
-        inexact = sharpest < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
-        if inexact and len(places) >= _ROUGH * _LEAST_STATIONS:
-            rough = self._measure(
-                image, places.every(_ROUGH), pose, prior, colours, attitude, rough=True)
-            if rough is None and reach > 0.0:
-                return None
-            if rough is not None:
-                pose = rough.refinement.pose
-                # What profiles bear needs no bands of its own.
-                if rough.leant > _SETTLED_BLURS * sharpest:
-                    attitude = rough.refinement.attitude
+        begun = self._begun(image, places, pose, prior, colours, reach)
+        if begun is None:
+            return None
+        pose, attitude = begun
         result: Alignment | None = None
         for k in range(_ITERATIONS):
             measured = self._measure(
@@ -223,6 +214,26 @@ class Aligner:
             return None
         # Stations that come and go near their thresholds can keep it stepping to and fro.
         return replace(result, covariance=result.covariance + np.outer(step, step))
+
+    def _begun(
+        self, image: NDArray[np.uint8], places: Places, start: Pose2,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], reach: float,
+    ) -> tuple[Pose2, Array] | None:
+        """The pose and the base's attitude to go on from: after a rough pass, if one is needed.
+
+        None where the start may be off, and too little is found.
+        """
+        level, sharpest = np.zeros(3), min(colour.blur for colour in colours)
+        inexact = sharpest < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
+        if not inexact or len(places) < _ROUGH * _LEAST_STATIONS:
+            return start, level
+        rough = self._measure(
+            image, places.every(_ROUGH), start, prior, colours, level, rough=True)
+        if rough is None:
+            return None if reach > 0.0 else (start, level)
+        # What profiles bear needs no bands of its own.
+        leans = rough.leant > _SETTLED_BLURS * sharpest
+        return rough.refinement.pose, rough.refinement.attitude if leans else level
 
     def _fit(
         self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...], rough: bool,
