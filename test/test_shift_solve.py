@@ -78,9 +78,7 @@ def test_stations_move_as_the_exact_projection_of_their_points_does(unknown: int
         return np.einsum('ni,ni->n', pixels, bands.across)
 
     numeric = (across(h) - across(-h)) / (2.0 * h)
-    # Of the attitude only its small prior's worth is ever needed: the mirror is taken for a point.
-    tolerance = 2e-3 if unknown < 3 else 0.05
-    assert np.abs(numeric - slide[:, unknown]).max() < tolerance * np.abs(numeric).max()
+    assert np.abs(numeric - slide[:, unknown]).max() < 2e-3 * np.abs(numeric).max()
 
 
 @pytest.mark.parametrize('degrees', [0.1, 0.3, 0.6])

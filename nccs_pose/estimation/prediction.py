@@ -189,7 +189,7 @@ class BandPredictor:
         np.multiply(against, left, out=slide[:2])
         np.multiply(against, (back * middle).real, out=slide[2])
         # Floor that sinks by dz is seen where the ray would have met it, further out.
-        sinking = against * (back * image.offset).imag * image.falls
+        sinking = against * (back * image.falls).imag
         slide[3] = sinking
         np.multiply(sinking, middle.imag, out=slide[4])
         np.multiply(-sinking, middle.real, out=slide[5])

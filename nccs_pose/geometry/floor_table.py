@@ -23,7 +23,6 @@ place on the floor need only be known roughly.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
 
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.pose import Array
@@ -31,50 +30,23 @@ from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, spline_filter
 
-# The angle from the nadir varies almost linearly with the image radius, so a coarse grid in
-# (angle, azimuth) with cubic splines is enough to make the table from.
-_ANGLES = 64
-_AZIMUTHS = 128
-_PADDING = 8
-_STRIDE = 8
-# What is read are expansions at the knots of a square grid over the stereographic plane, where the
-# floor is a disc and its image almost linear: so fine that the nearest knot's is good enough. So
-# many knots to either side of the middle; from one to the next, right and up, and where the middle
-# one is.
+# The forward table holds expansions at the knots of a square grid over the stereographic plane,
+# where the floor is the unit disc and its image almost linear: so fine that the nearest knot's is
+# good enough. So many knots to either side of the middle; from one to the next, right and up, and
+# where the middle one is.
 _CELLS = 112
 _KNOTS_APART = np.array([1.0, 2.0 * _CELLS + 1.0])
 _MIDDLE_KNOT = _CELLS * _KNOTS_APART.sum()
+# The derivatives at a knot come from the knots about it, twice; and the nearest to a point may lie
+# a little beyond it.
+_MARGIN = 3.0 / _CELLS
 # What lies beyond the table is seen outside of any image, and goes on from there as it will.
 _OUTSIDE = np.array([-1e6, 1.0, 0.0, 0.0, 0.0, 0.0])
-# Where the nadir, and straight ahead, are in the grid.
-_BEGIN = np.array([[_PADDING], [_PADDING + 0.5 * _AZIMUTHS]])
-# Weights of the four coefficients of a cubic spline about a point as polynomials in its place t
-# between the second and the third; 1 to t^3 by rows.
-_BASIS = np.array([
-    [1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0],
-    [-1.0, 3.0, -3.0, 1.0]]) / 6.0
-# The spline and its first two derivatives at a knot, by the coefficients about it.
-_AT_KNOT = np.array([[1.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [6.0, -12.0, 6.0]]) / 6.0
-
+# The backward table has a point for every so many pixels.
+_STRIDE = 8
 
 Complex = NDArray[np.complex128]
-
-
-def _weights(at: Array, cell: NDArray[np.intp]) -> Array:
-    """Weights of the four coefficients about places (2, N) after the knots before (4, 2, N)."""
-    powers = np.empty((4, *at.shape))
-    powers[0] = 1.0
-    t = np.subtract(at, cell, out=powers[1])
-    np.multiply(t, t, out=powers[2])
-    np.multiply(powers[2], t, out=powers[3])
-    return (_BASIS.T @ powers.reshape(4, -1)).reshape(powers.shape)
-
-
-def _filtered(values: Complex) -> Complex:
-    """Spline coefficients of values on a grid."""
-    return np.asarray(spline_filter(values.real) + 1j * spline_filter(values.imag))
 
 
 def as_complex(vectors: Array) -> Complex:
@@ -95,15 +67,12 @@ class FloorExpansion:
     goes by d is seen at p + P d + Q d* + (U d^2 + 2 V |d|^2 + W d*^2) / 2, d* the conjugate.
 
     :ivar terms: p, P, Q, U, V and W by rows (6, N); px, px per metre, px per square metre.
-    :ivar offset: of the points from the mirror's foot (N,), metres.
-    :ivar falls: how far outward over the floor a ray goes as it falls by a metre, in parts of the
-        offset (N,).
+    :ivar falls: how far over the floor their rays go as they fall by a metre (N,).
     :ivar seen: whether the image shows the floor about there (N,), to a few px.
     """
 
     terms: Complex
-    offset: Complex
-    falls: Array
+    falls: Complex
     seen: NDArray[np.bool_]
 
     @property
@@ -131,14 +100,7 @@ class FloorTable:
         if self.height <= 0.0:
             raise GeometryError(
                 f'the mirror at height {self.height} m does not stand over a floor')
-        self._last_angle = math.atan2(1.02 * reach, self.height)
         self._foot = complex(*self.foot)
-        self._knots_per_radian = np.array(
-            [[_ANGLES / self._last_angle], [_AZIMUTHS / (2.0 * np.pi)]])
-        spline = self._forward()
-        rows, self._columns = spline.shape
-        self._last_row = rows - 2.0 - 1e-9
-        self._taps = (np.arange(-1, 3)[:, None] * self._columns + np.arange(-1, 3)).ravel()
         self._grid, self._grid_reaches = self._backward()
         self.region = self._region()
         # All that lies outside comes to lie on the frame round it.
@@ -147,131 +109,73 @@ class FloorTable:
         # From one pixel to the next, right and down, and where the first one is.
         self._apart = np.array([1.0, rig.camera.width + 2.0])
         self._first = rig.camera.width + 3.0
-        self._knots = self._expanded(self._expansions(spline).view(np.float64).reshape(-1, 12))
+        self._knots = self._forward()
 
     def _forward(self) -> Complex:
-        """Spline coefficients of the pixels over (angle from the nadir, azimuth from -pi)."""
-        # Through the nadir the angle goes on negative, and the azimuth goes round: padding
-        # keeps every point of use away from the grid's ends.
-        angle = (np.arange(-_PADDING, _ANGLES + 1) / _ANGLES) * self._last_angle
-        azimuth = (np.arange(-_PADDING, _AZIMUTHS + _PADDING) / _AZIMUTHS) * 2.0 * np.pi - np.pi
-        radius = self.height * np.tan(angle)
-        points = np.zeros((len(angle), len(azimuth), 3))
-        points[..., 0] = self.foot[0] + radius[:, None] * np.cos(azimuth)
-        points[..., 1] = self.foot[1] + radius[:, None] * np.sin(azimuth)
+        """What is known at the knots (M, 9).
+
+        The terms there, the knot's offset from the mirror's foot, the falls, and one over the
+        height at which the ray leaves the mirror, with 1 for the imaginary part where the image
+        shows the floor.
+        """
+        cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
+        place: Complex = cells + 1j * cells[:, None]
+        inside = 1.0 - np.abs(place) ** 2
+        ends = self._place(np.array([self.reach + 0j])).real + _MARGIN
+        known = (np.abs(place) < ends) & (inside > 0.0)
+        inside[~known] = np.nan
+        # What is not known is not a number, nor are derivatives next to it.
+        with np.errstate(invalid='ignore'):
+            offset = 2.0 * self.height * place / inside
+            pixel, mirror, height = self._exact(offset, known)
+            # The offset's own derivatives by the place and by its conjugate.
+            by_place = 2.0 * self.height / inside**2
+            by_conjugate = by_place * place**2
+            area = by_place**2 - np.abs(by_conjugate) ** 2
+
+            def by_ground(value: Complex) -> tuple[Complex, Complex]:
+                """Derivatives by the offset and by its conjugate."""
+                up, right = np.gradient(value, 1.0 / _CELLS)
+                a, b = 0.5 * (right - 1j * up), 0.5 * (right + 1j * up)
+                return ((a * by_place - b * by_conjugate.conj()) / area,
+                        (b * by_place - a * by_conjugate) / area)
+
+            first, conjugate = by_ground(pixel)
+            twice, mixed = by_ground(first)
+            mixed_too, conjugate_twice = by_ground(conjugate)
+        terms = np.stack([
+            pixel, first, conjugate, twice, 0.5 * (mixed + mixed_too), conjugate_twice], axis=-1)
+        unknown = np.isnan(terms).any(axis=-1)
+        terms[unknown], mirror[unknown], height[unknown] = _OUTSIDE, 0.0, self.height
+        offset[unknown] = 0.0
+        seen = self.sees_floor(as_points(terms[..., 0].ravel())).reshape(unknown.shape)
+        if not seen.any():
+            raise GeometryError('the rig sees no floor within its reach')
+        known_there = np.stack([offset, (offset - mirror) / height, 1.0 / height + 1j * seen], -1)
+        return np.concatenate([terms, known_there], axis=-1).reshape(-1, 9)
+
+    def _exact(self, offset: Complex, known: NDArray[np.bool_]) -> tuple[Complex, Complex, Array]:
+        """How points of the floor are seen, NaN where they are not.
+
+        :param offset: from the mirror's foot (...), metres.
+        :param known: which of them count (...).
+        :returns: pixels; and where their rays leave the mirror: over the floor, from its foot,
+            and how high, metres.
+        """
+        points = np.zeros((np.count_nonzero(known), 3))
+        points[:, :2] = as_points(offset[known] + self._foot)
         rig = self.rig
         # The rim is a matter of visibility, not of where a point would be seen.
         whole = replace(rig.mirror, rim_radius=None)
-        m, visible = reflect_points(
-            whole, rig.cop, rig.T_base_mirror.inverse().apply(points.reshape(-1, 3)))
+        m, visible = reflect_points(whole, rig.cop, rig.T_base_mirror.inverse().apply(points))
         pixels, in_front = rig.camera.project((m - rig.cop) @ rig.R_mirror_camera)
-        seen = (visible & in_front).reshape(points.shape[:2])
-        mirror, falls = self._rays(points, m, seen)
-        # As many rows as the pixels have after their padding.
-        mirror = np.pad(mirror, ((0, _PADDING), (0, 0), (0, 0)), mode='edge')
-        self._mirror_points = np.stack(
-            [spline_filter(mirror[..., k]) for k in range(3)], axis=-1).reshape(-1, 3)
-        # Outward, past the foot, and as good as the same all round.
-        past = radius[_PADDING + 1:]
-        outward = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) / len(azimuth)
-        self._outward = past, np.einsum('rai,ai->r', falls[_PADDING + 1:], outward) / past
-        if not seen[_PADDING].any():
-            raise GeometryError('the rig sees no floor: its nadir is not in the mirror')
-        pixels = pixels.reshape(*points.shape[:2], 2)
-        for row in range(_PADDING + 1, len(angle)):
-            blind = ~seen[row]
-            # Beyond what the mirror shows, carry the last slope on; nothing is read there.
-            pixels[row, blind] = 2.0 * pixels[row - 1, blind] - pixels[row - 2, blind]
-        # Near the horizon a ground point runs to infinity, but its pixel goes on smoothly: the
-        # cubic through the last rows pads the end, or the spline would ring there.
-        rows = list(pixels)
-        for _ in range(_PADDING):
-            rows.append(4.0 * rows[-1] - 6.0 * rows[-2] + 4.0 * rows[-3] - rows[-4])
-        padded = np.array(rows)
-        return _filtered(padded[..., 0] + 1j * padded[..., 1])
-
-    def _expansions(self, spline: Complex) -> Complex:
-        """Spline coefficients of the terms of expansions (angles, azimuths, 6).
-
-        :param spline: of the pixels (angles, azimuths).
-        """
-        rows, columns = spline.shape
-        angle = ((np.arange(rows) - _PADDING) * (self._last_angle / _ANGLES))[:, None]
-        azimuth = (np.arange(columns) - _PADDING) * (2.0 * np.pi / _AZIMUTHS) - np.pi
-        by = (_ANGLES / self._last_angle, _AZIMUTHS / (2.0 * np.pi))
-
-        def partial(i: int, j: int) -> Complex:
-            """Derivative by the angle, so many times, and by the azimuth."""
-            along = correlate1d(spline, _AT_KNOT[i] * by[0]**i, axis=0, mode='nearest')
-            return np.asarray(
-                correlate1d(along, _AT_KNOT[j] * by[1]**j, axis=1, mode='nearest'))
-
-        # The angle's derivatives by the radius, and the radius' inverse, to the horizon and on.
-        by_radius = np.cos(angle) ** 2 / self.height
-        bend = -2.0 * np.sin(angle) * np.cos(angle) ** 3 / self.height**2
-        angle[_PADDING] = np.nan
-        inverse = 1.0 / (self.height * np.tan(angle))
-        out, turned = by_radius * partial(1, 0), inverse * partial(0, 1)
-        out_twice = by_radius**2 * partial(2, 0) + bend * partial(1, 0)
-        mixed = inverse * (by_radius * partial(1, 1) - turned)
-        turned_twice = inverse * (inverse * partial(0, 2) + out)
-        outward = np.exp(-1j * azimuth)
-        terms = np.stack([
-            spline, 0.5 * (out - 1j * turned) * outward, 0.5 * (out + 1j * turned) / outward,
-            0.25 * (out_twice - 2j * mixed - turned_twice) * outward**2,
-            0.25 * (out_twice + turned_twice),
-            0.25 * (out_twice + 2j * mixed - turned_twice) / outward**2])
-        # At the mirror's foot there is no direction outward: what is about it says how it goes on.
-        near, far = (terms[1:, _PADDING - k] + terms[1:, _PADDING + k] for k in (1, 2))
-        terms[1:, _PADDING] = (4.0 * near - far) / 6.0
-        for k in range(1, 6):
-            terms[k] = _filtered(terms[k])
-        return np.ascontiguousarray(terms.transpose(1, 2, 0))
-
-    def _expanded(self, coefficients: Array) -> Complex:
-        """What is known at the knots (M, 8).
-
-        The terms there, the knot's offset from the mirror's foot, and the falls, with 1 for the
-        imaginary part where the floor is seen.
-
-        :param coefficients: of the terms over angle and azimuth (angles x azimuths, 12).
-        """
-        cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
-        place: Complex = (cells + 1j * cells[:, None]).ravel()
-        # Infinity is the unit circle; what lies on it or beyond is far enough.
-        offset = place * (2.0 * self.height / np.maximum(1.0 - np.abs(place) ** 2, 1e-3))
-        radius = np.abs(offset)
-        knots = np.empty((len(place), 8), dtype=complex)
-        knots[:, :6] = _OUTSIDE
-        inside, = (self._places(offset, radius)[0] < self._last_row).nonzero()
-        # Some at a time: sixteen coefficients for each fill the memory.
-        for some in np.array_split(inside, len(cells)):
-            knots[some, :6] = self._read(
-                coefficients, offset[some], radius[some]).view(np.complex128)
-        knots[:, 6] = offset
-        knots[:, 7] = np.interp(radius, *self._outward) + 1j * self.sees_floor(
-            as_points(knots[:, 0]))
-        return knots
-
-    def _rays(
-        self, points: Array, m: Array, seen: NDArray[np.bool_],
-    ) -> tuple[Array, Array]:
-        """Where rays leave the mirror, and how far over the floor they go as they fall by a metre.
-
-        Where none is seen stands that of the angle before.
-
-        :param points: on the floor (angles, azimuths, 3), in base_link.
-        :param m: their mirror points, in the mirror frame (angles x azimuths, 3).
-        :param seen: which are seen (angles, azimuths).
-        :returns: the mirror points in base_link (angles, azimuths, 3); and the falls
-            (angles, azimuths, 2).
-        """
-        mirror = self.rig.T_base_mirror.apply(m).reshape(points.shape)
-        falls = (points[..., :2] - mirror[..., :2]) / np.maximum(mirror[..., 2:], 1e-6)
-        for row in range(1, len(falls)):
-            mirror[row, ~seen[row]] = mirror[row - 1, ~seen[row]]
-            falls[row, ~seen[row]] = falls[row - 1, ~seen[row]]
-        return mirror, falls
+        m = rig.T_base_mirror.apply(m)
+        m[~(visible & in_front)] = pixels[~(visible & in_front)] = np.nan
+        pixel = np.full(offset.shape, np.nan, dtype=complex)
+        mirror, height = pixel.copy(), np.full(offset.shape, np.nan)
+        pixel[known], mirror[known] = as_complex(pixels), as_complex(m[:, :2]) - self._foot
+        height[known] = m[:, 2]
+        return pixel, mirror, height
 
     def met(self, points: Array, rise: Array) -> Array:
         """Where rays that see points over the floor meet it (N, 2), in base_link.
@@ -279,12 +183,12 @@ class FloorTable:
         :param points: (N, 2), metres.
         :param rise: how far they are over the floor, or under it (N,); small, metres.
         """
-        offset = as_complex(points) - self._foot
-        mirror = self._read(self._mirror_points, offset, np.abs(offset))
+        at = as_complex(points)
+        knots, step = self._nearest(at)
+        steeper = knots[:, 8].real
         # The ray meets the floor a little further on, but comes from the same place.
-        z = mirror[:, 2]
-        share = rise / np.maximum(z - rise, 0.5 * z)
-        return points + share[:, None] * (points - mirror[:, :2])
+        share = rise / np.maximum(1.0 - rise * steeper, 0.5)
+        return as_points(at + share * (knots[:, 7] + steeper * step))
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
@@ -295,46 +199,28 @@ class FloorTable:
 
         From the nearest knot on, to second order.
         """
-        offset = points - self._foot
-        # In steps from knot to knot.
-        place = offset * (_CELLS / (self.height + np.hypot(np.abs(offset), self.height)))
-        nearest = np.rint(place).view(np.float64).reshape(-1, 2) @ _KNOTS_APART + _MIDDLE_KNOT
-        knots = self._knots.take(nearest.astype(np.intp), axis=0, mode='clip')
+        knots, step = self._nearest(points)
         terms = np.ascontiguousarray(knots[:, :6].T)
-        step = offset - knots[:, 6]
         back = step.conj()
         # Half of what the step adds to the first derivatives; the pixel goes by their mean.
         slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
         slopes += added
         terms[0] += slopes[0] * step + slopes[1] * back
         slopes += added
-        return FloorExpansion(terms, offset, knots[:, 7].real, knots[:, 7].imag > 0.0)
+        return FloorExpansion(
+            terms, knots[:, 7] + knots[:, 8].real * step, knots[:, 8].imag > 0.0)
 
-    def _read(self, coefficients: Array, offset: Complex, radius: Array) -> Array:
-        """Values (N, K) of splines at floor points.
+    def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
+        """The nearest knots to points (N, 9), see :meth:`_forward`, and the way from them (N,)."""
+        offset = points - self._foot
+        place = np.rint(_CELLS * self._place(offset)).view(np.float64).reshape(-1, 2)
+        at = place @ _KNOTS_APART + _MIDDLE_KNOT
+        knots = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
+        return knots, offset - knots[:, 6]
 
-        :param coefficients: by angle and azimuth, one knot after the other (M, K).
-        :param offset: of the points from the mirror's foot (N,), metres.
-        :param radius: its length (N,).
-        """
-        at = self._places(offset, radius)
-        cell = at.astype(np.intp)
-        first = cell[0] * self._columns + cell[1]
-        by_one = _weights(at, cell)
-        weights = (by_one[:, None, 0] * by_one[None, :, 1]).reshape(16, -1).T
-        # No index is out of range; 'clip' only spares a check.
-        around = coefficients.take(first[:, None] + self._taps, axis=0, mode='clip')
-        return (weights[:, None] @ around)[:, 0]
-
-    def _places(self, offset: Complex, radius: Array) -> Array:
-        """Places in the grid by angle and azimuth (2, N) of floor points; see :meth:`_read`."""
-        at = np.empty((2, len(offset)))
-        np.arctan(radius / self.height, out=at[0])
-        np.arctan2(offset.imag, offset.real, out=at[1])
-        at *= self._knots_per_radian
-        at += _BEGIN
-        np.minimum(at[0], self._last_row, out=at[0])
-        return at
+    def _place(self, offset: Complex) -> Complex:
+        """Where the stereographic plane has points of the floor: infinity is the unit circle."""
+        return offset / (self.height + np.hypot(np.abs(offset), self.height))
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
