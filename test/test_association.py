@@ -19,15 +19,13 @@ from __future__ import annotations
 from dataclasses import replace
 import itertools
 
-from nccs_pose.estimation.association import (
-    Associator,
-    map_symmetries,
-    same_pose,
-)
+from nccs_pose.estimation.association import Associator
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines
+from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import as_points, FloorTable

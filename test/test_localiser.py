@@ -23,10 +23,10 @@ import math
 from typing import Any
 
 from nccs_pose.estimation.alignment import Aligner, Alignment
-from nccs_pose.estimation.association import map_symmetries
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle

@@ -21,9 +21,9 @@ from collections.abc import Sequence
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.hypotheses import confronted, Hypothesis
 from nccs_pose.estimation.judge import Found, is_expected
+from nccs_pose.estimation.ledger import Sifted
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.sifting import Sifted
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import lines_used
 

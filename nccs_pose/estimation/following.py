@@ -19,12 +19,12 @@ from __future__ import annotations
 from collections.abc import Set
 
 from nccs_pose.estimation.alignment import Aligner
-from nccs_pose.estimation.association import same_pose
 from nccs_pose.estimation.judge import Found, is_expected, Judge
+from nccs_pose.estimation.ledger import Refused
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.sifting import Refused
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.verdict import contradiction, Objection
 from nccs_pose.geometry.lines import LineMap

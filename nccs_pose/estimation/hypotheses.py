@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from nccs_pose.estimation.association import same_pose
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.geometry.pose import Pose2
 
 # Images that a hypothesis must have explained before it is chosen among several.

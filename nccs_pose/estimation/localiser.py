@@ -27,7 +27,6 @@ from dataclasses import replace
 
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.alignment import Aligner
-from nccs_pose.estimation.association import map_symmetries, same_pose
 from nccs_pose.estimation.decision import left_open, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,
@@ -40,13 +39,16 @@ from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
+from nccs_pose.estimation.ledger import Refused
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.sifting import Case, Refused, Sifter
+from nccs_pose.estimation.sifting import Case, Sifter
 from nccs_pose.estimation.sights import sights
 from nccs_pose.estimation.stopwatch import Stopwatch
+from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import what_is_missing
 from nccs_pose.geometry.floor_table import FloorTable

@@ -16,16 +16,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from itertools import islice
 import math
 
 from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
-from nccs_pose.estimation.association import FittedCandidate, same_pose
-from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
+from nccs_pose.estimation.ledger import Ledger, Refused, Sifted
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.sights import ALL_STRIPS, Sight
@@ -48,31 +50,6 @@ _PLAINLY_ALL = 0.9
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Refused:
-    """A pose that was laid on the image, and what the image says against it."""
-
-    objection: Objection | None = None
-    alignment: Alignment | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Sifted:
-    """What a search of the whole image leaves.
-
-    :ivar held: poses that explain the image, best first.
-    :ivar hidden: poses that would, if something hid the lines that they miss.
-    :ivar refused: the others, the best first.
-    :ivar open: poses that may explain it as well as the best of those that hold, but were not
-        laid on it, or that it cannot tell from another; their scores are no higher than its.
-    """
-
-    held: list[Found]
-    hidden: list[Candidate]
-    refused: list[Refused]
-    open: list[Candidate]
 
 
 @dataclass(frozen=True)
@@ -140,74 +117,62 @@ class Sifter:
         self._symmetries = symmetries
         self._options = options
 
-    def sift(self, case: Case, hypotheses: tuple[Hypothesis, ...]) -> Sifted:
+    def sift(self, case: Case, hypotheses: Sequence[Hypothesis]) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image."""
-        sight, told = case.sight, case.told
-        options = self._options
-        candidates = sight.candidates
+        candidates, told = case.sight.candidates, case.told
         if told is not None and len(candidates) > _TRIED:
             candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
-        starts = [_Start(h.pose, options.band) for h in hypotheses]
-        starts += [_Start.of(c) for c in candidates[:_TRIED]
-                   if c.score >= _WORTH_TRYING * sight.promise]
-        left = list(candidates[_TRIED:])
-        sifted = Sifted([], [], [], [])
-        doubtful: list[Found] = []
-        equal: list[Pose2] = []
-        seen: list[Pose2] = []
-        # An image shows of these what it showed of the pose whose twins they are.
-        twins: list[Pose2] = []
-        best: tuple[_Start, Found] | None = None
+        ledger = Ledger(
+            self._symmetries, told, self._options.ambiguity_ratio, candidates[_TRIED:])
+        starts = deque(_Start(h.pose, self._options.band) for h in hypotheses)
+        starts += (_Start.of(c) for c in candidates[:_TRIED]
+                   if c.score >= _WORTH_TRYING * case.sight.promise)
         undecided = False
-        for start in starts:
-            if any(same_pose(start.pose, pose) for pose in (*seen, *twins)):
-                continue
-            if best is not None and not self._rivals(start, *best):
+        while starts:
+            start = starts.popleft()
+            if ledger.knows(start.pose) or self._is_beaten(start, ledger):
                 continue
             if undecided:
                 # What the image shows of the hypotheses is among the candidates.
-                left += [start.strips] if start.strips is not None else []
+                if start.strips is not None:
+                    ledger.leave(start.strips)
                 continue
-            if case.prediction is None and start.strips is not None:
-                against = self._judge.beforehand(start.strips)
-                if against is not None:
-                    sifted.refused.append(Refused(against))
-                    sifted.hidden.append(Candidate(start.pose, start.strips.score))
-                    continue
-            verdict = self._again(case, start) or self._verdict(case, start, seen)
-            pose = start.pose if verdict is None else verdict[0].pose
-            own = [s @ pose for s in self._symmetries]
-            if told is None and (verdict is None or verdict[1] is not _DOUBTFUL):
-                twins += own
-            if verdict is None:
-                continue
-            alignment, found = verdict
-            seen.append(pose)
-            if isinstance(found, Objection):
-                sifted.refused.append(Refused(found, alignment))
-                if found is _DOUBTFUL:
-                    doubtful.append(self._measured(sight, start, alignment))
-                elif found.hidden:
-                    shown = self._measured(sight, start, alignment)
-                    alike = (pose, *own) if told is None else (pose,)
-                    sifted.hidden.extend(Candidate(p, shown.by_strips) for p in alike)
-                continue
-            sifted.held.append(found)
-            for twin in own:
-                if told is not None and told.holds(twin):
-                    starts.append(_Start(twin, _SEARCH_BAND))
-                else:
-                    equal.append(twin)
-            if best is None or found.score > best[1].score:
-                best = start, found
-            undecided = told is None and (
-                len(self._equals(sifted.held)) > 1 or self._is_repeated(best[1], candidates))
-        sifted.held.sort(key=lambda f: -f.score)
-        if best is not None:
-            self._leave_open(sifted, best[1], left, equal, doubtful, seen)
-        return sifted
+            found = self._tried(case, start, ledger)
+            if found is not None:
+                starts += (_Start(twin, _SEARCH_BAND)
+                           for twin in ledger.hold(found, start.misfit))
+                undecided = self._is_undecided(case, ledger)
+        return ledger.closed()
 
-    def _is_repeated(self, held: Found, candidates: Sequence[FittedCandidate]) -> bool:
+    def _tried(self, case: Case, start: _Start, ledger: Ledger) -> Found | None:
+        """A pose laid on the image, if it holds; else what came of it is in the ledger."""
+        if case.prediction is None and start.strips is not None:
+            against = self._judge.beforehand(start.strips)
+            if against is not None:
+                ledger.rule_out(start.strips, against)
+                return None
+        verdict = self._again(case, start) or self._verdict(case, start, ledger)
+        if verdict is None:
+            ledger.miss(start.pose)
+            return None
+        alignment, found = verdict
+        if isinstance(found, Found):
+            return found
+        if found is _DOUBTFUL:
+            ledger.doubt(found, self._measured(case.sight, start, alignment))
+        elif found.hidden:
+            ledger.hide(found, self._measured(case.sight, start, alignment))
+        else:
+            ledger.refuse(found, alignment)
+        return None
+
+    def _is_undecided(self, case: Case, ledger: Ledger) -> bool:
+        """Whether an image decides nothing between poses that hold, nor does anything else."""
+        best = ledger.best
+        return best is not None and case.told is None and (
+            ledger.is_tied() or self._has_many_equals(best, case.sight.candidates))
+
+    def _has_many_equals(self, held: Found, candidates: Sequence[FittedCandidate]) -> bool:
         """Whether more places than are laid on an image show as much as one that holds.
 
         Then it decides nothing, and those that it shows are all among the candidates.
@@ -217,45 +182,8 @@ class Sifter:
                  if c.score >= least and not same_pose(c.pose, held.alignment.pose))
         return len(list(islice(equal, _TRIED + 1))) > _TRIED
 
-    def _equals(self, found: list[Found]) -> list[Found]:
-        """Those of some poses that explain an image about as well as the best of them."""
-        most = max((f.score for f in found), default=0.0)
-        return [f for f in found if f.score >= self._options.ambiguity_ratio * most]
-
-    def _leave_open(
-        self, sifted: Sifted, best: Found, left: list[FittedCandidate], equal: list[Pose2],
-        doubtful: list[Found], seen: list[Pose2],
-    ) -> None:
-        """Add the poses that are left open, beside the best that holds, and what may be hidden.
-
-        :param left: candidates that were not laid on the image.
-        :param equal: twins of what holds that were not.
-        :param doubtful: what was, and shows about as much as another pose.
-        :param seen: all that was laid on the image.
-        """
-        ratio = self._options.ambiguity_ratio
-        for found in doubtful:
-            pose = found.alignment.pose
-            if found.score >= ratio * best.score:
-                sifted.open.append(Candidate(pose, min(found.score, best.score)))
-            else:
-                sifted.hidden.append(Candidate(pose, found.by_strips))
-        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
-        twins, seen = [found.alignment.pose for found in sifted.held], list(seen)
-        for pose in equal:
-            if not any(same_pose(pose, twin) for twin in twins):
-                twins.append(pose)
-                sifted.open.append(Candidate(pose, best.score))
-        seen += twins
-        # Candidates differ among themselves.
-        for strips in left:
-            share = min(strips.score / best.by_strips, 1.0)
-            if share >= ratio and not any(same_pose(strips.pose, pose) for pose in seen):
-                sifted.open.append(Candidate(strips.pose, share * best.score))
-        sifted.open.sort(key=lambda candidate: -candidate.score)
-
     def _verdict(
-        self, case: Case, start: _Start, seen: list[Pose2],
+        self, case: Case, start: _Start, ledger: Ledger,
     ) -> tuple[Alignment, Found | Objection] | None:
         """Lay a pose on the image, and judge it; None where it does not lie, or was seen before.
 
@@ -271,7 +199,7 @@ class Sifter:
                 hopeless=misses_lines if case.prediction is None else None)
             if alignment is None:
                 continue
-            if any(same_pose(alignment.pose, pose) for pose in seen):
+            if ledger.was_laid(alignment.pose):
                 return verdict
             expected = self._expected(case, alignment)
             found = self._judge.found(
@@ -323,26 +251,27 @@ class Sifter:
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
         if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
             return found
-        if case.told is None and self._is_repeated(found, candidates):
+        if case.told is None and self._has_many_equals(found, candidates):
             return found
         least = self._options.ambiguity_ratio * found.by_strips
         rivals = any(c.score >= least and not same_pose(c.pose, alignment.pose)
                      for c in candidates)
         return _DOUBTFUL if rivals else found
 
-    def _rivals(self, start: _Start, held_from: _Start, held: Found) -> bool:
-        """Whether what a pose shows on the strips leaves it a chance against one that holds.
+    def _is_beaten(self, start: _Start, ledger: Ledger) -> bool:
+        """Whether what a pose shows on the strips leaves it no chance against the best that holds.
 
         No pose scores more on the image than the root of what it scores on the strips, times
         what is left of that by how far they lie off its lines; and where the strips show all that
         the pose that holds expects, and nothing else, they tell rivals as well as the image: but
         for one that leaves no strip unexplained, of which more may be there than the strips show.
         """
-        if start.strips is None:
-            return True
-        ratio, score = self._options.ambiguity_ratio, start.strips.score
-        if explains_nearly_all(held) and score < ratio * held.by_strips and (
-                start.strips.claimed < ALL_STRIPS):
+        best, strips = ledger.best, start.strips
+        if best is None or strips is None:
             return False
-        excess = max(start.misfit**2 - held_from.misfit**2, 0.0)
-        return math.sqrt(score) * fit_of(excess) >= ratio * held.score
+        ratio = self._options.ambiguity_ratio
+        if explains_nearly_all(best) and strips.score < ratio * best.by_strips and (
+                strips.claimed < ALL_STRIPS):
+            return True
+        excess = max(strips.misfit**2 - ledger.best_misfit**2, 0.0)
+        return math.sqrt(strips.score) * fit_of(excess) < ratio * best.score

@@ -67,7 +67,7 @@ class Sight:
             self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise)
 
     @property
-    def is_repeated(self) -> bool:
+    def is_of_many_places(self) -> bool:
         """Whether many places show all that is seen here: more of it would tell none of them."""
         equal = [c for c in self.candidates
                  if c.claimed > ALL_STRIPS and c.score > _RIVAL * self.promise]
@@ -108,7 +108,7 @@ def sights(
             sight = best = replace(best, colours=shown)
         if sight.is_promising:
             tried.append(sight)
-        if sight.is_promising or sight.is_repeated:
+        if sight.is_promising or sight.is_of_many_places:
             yield sight
         if len(tried) > 1 and best.promise > _PLAIN:
             return

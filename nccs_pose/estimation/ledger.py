@@ -1,0 +1,191 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What came of the poses that were laid on one image, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.judge import Found
+from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.verdict import Objection
+from nccs_pose.geometry.pose import Pose2
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A pose that was laid on the image, and what the image says against it."""
+
+    objection: Objection | None = None
+    alignment: Alignment | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sifted:
+    """What a search of the whole image leaves.
+
+    :ivar held: poses that explain the image, best first.
+    :ivar hidden: poses that would, if something hid the lines that they miss.
+    :ivar refused: the others, the best first.
+    :ivar open: poses that may explain it as well as the best of those that hold, but were not
+        laid on it, or that it cannot tell from another; their scores are no higher than its.
+    """
+
+    held: list[Found]
+    hidden: list[Candidate]
+    refused: list[Refused]
+    open: list[Candidate]
+
+
+class Ledger:
+    """Which poses of an image are known, and what is known of them.
+
+    A symmetric map has twins of every pose, of which the image shows the same.
+
+    :ivar best: of the poses that hold, None if none does.
+    :ivar best_misfit: how far the strips lay off the lines where it was begun from, px.
+    """
+
+    def __init__(
+        self, symmetries: Sequence[Pose2], told: Told | None, ratio: float,
+        left: Iterable[FittedCandidate],
+    ) -> None:
+        """Begin.
+
+        :param symmetries: motions of the map that change nothing, without the identity.
+        :param told: where the robot is by something else than the image; without it nothing is
+            learned of a twin by laying it on the image too.
+        :param ratio: a pose that scores this part of the best is its equal.
+        :param left: candidates that are not to be laid on the image.
+        """
+        self.best: Found | None = None
+        self.best_misfit = 0.0
+        self._symmetries = symmetries
+        self._told = told
+        self._ratio = ratio
+        # Poses that lie on the image, whatever it says of them.
+        self._laid: list[Pose2] = []
+        # Twins of which nothing more would be learned.
+        self._settled: list[Pose2] = []
+        self._held: list[Found] = []
+        self._refused: list[Refused] = []
+        self._hidden: list[Candidate] = []
+        # What would hold, if another pose did not show about as much.
+        self._doubtful: list[Found] = []
+        # Twins of what holds that are not laid on the image themselves.
+        self._equal: list[Pose2] = []
+        self._left = list(left)
+
+    def knows(self, pose: Pose2) -> bool:
+        """Whether a pose need not be laid on the image: it or its twin was."""
+        return any(same_pose(pose, other) for other in (*self._laid, *self._settled))
+
+    def was_laid(self, pose: Pose2) -> bool:
+        """Whether a pose is one that lies on the image."""
+        return any(same_pose(pose, other) for other in self._laid)
+
+    def is_tied(self) -> bool:
+        """Whether several poses explain the image about as well as the best of them."""
+        return self.best is not None and len(
+            [f for f in self._held if f.score >= self._ratio * self.best.score]) > 1
+
+    def leave(self, strips: FittedCandidate) -> None:
+        """Leave a candidate that was not laid on the image."""
+        self._left.append(strips)
+
+    def rule_out(self, strips: FittedCandidate, against: Objection) -> None:
+        """Refuse a candidate by its strips alone, unless something is hidden."""
+        self._refused.append(Refused(against))
+        self._hidden.append(Candidate(strips.pose, strips.score))
+
+    def miss(self, pose: Pose2) -> None:
+        """Note a pose that does not lie on the image."""
+        self._settle_twins(pose)
+
+    def hold(self, found: Found, misfit: float) -> list[Pose2]:
+        """Note a pose that holds.
+
+        :param misfit: how far the strips lay off the lines where it was begun from, px.
+        :returns: those of its twins that have to be laid on the image too.
+        """
+        self._laid.append(found.alignment.pose)
+        self._settle_twins(found.alignment.pose)
+        self._held.append(found)
+        if self.best is None or found.score > self.best.score:
+            self.best, self.best_misfit = found, misfit
+        twins, told = self._twins(found.alignment.pose), self._told
+        there = [told is not None and told.holds(twin) for twin in twins]
+        self._equal += [twin for twin, near in zip(twins, there) if not near]
+        return [twin for twin, near in zip(twins, there) if near]
+
+    def doubt(self, against: Objection, shown: Found) -> None:
+        """Note a pose that would hold, if another did not show about as much."""
+        self._laid.append(shown.alignment.pose)
+        self._refused.append(Refused(against, shown.alignment))
+        self._doubtful.append(shown)
+
+    def refuse(self, against: Objection, alignment: Alignment) -> None:
+        """Note a pose that does not hold."""
+        self._laid.append(alignment.pose)
+        self._settle_twins(alignment.pose)
+        self._refused.append(Refused(against, alignment))
+
+    def hide(self, against: Objection, shown: Found) -> None:
+        """Note a pose that would hold, if something hid the lines that it misses."""
+        pose = shown.alignment.pose
+        self.refuse(against, shown.alignment)
+        alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
+        self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
+
+    def closed(self) -> Sifted:
+        """What is left when no more poses are laid on the image."""
+        held = sorted(self._held, key=lambda f: -f.score)
+        left_open = [] if self.best is None else self._open(held, self.best)
+        return Sifted(held, self._hidden, self._refused, left_open)
+
+    def _twins(self, pose: Pose2) -> list[Pose2]:
+        return [s @ pose for s in self._symmetries]
+
+    def _settle_twins(self, pose: Pose2) -> None:
+        if self._told is None:
+            self._settled += self._twins(pose)
+
+    def _open(self, held: list[Found], best: Found) -> list[Candidate]:
+        """The poses that are left open beside those that hold; hides the doubtful that are not."""
+        found: list[Candidate] = []
+        for doubtful in self._doubtful:
+            pose = doubtful.alignment.pose
+            if doubtful.score >= self._ratio * best.score:
+                found.append(Candidate(pose, min(doubtful.score, best.score)))
+            else:
+                self._hidden.append(Candidate(pose, doubtful.by_strips))
+        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
+        known = [f.alignment.pose for f in held]
+        for twin in self._equal:
+            if not any(same_pose(twin, pose) for pose in known):
+                known.append(twin)
+                found.append(Candidate(twin, best.score))
+        known += self._laid
+        # Candidates differ among themselves.
+        for strips in self._left:
+            share = min(strips.score / best.by_strips, 1.0)
+            if share >= self._ratio and not any(same_pose(strips.pose, p) for p in known):
+                found.append(Candidate(strips.pose, share * best.score))
+        return sorted(found, key=lambda candidate: -candidate.score)

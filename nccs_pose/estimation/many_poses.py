@@ -1,0 +1,76 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Many poses at once, and which of them are one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from nccs_pose.geometry.floor_table import Complex
+from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
+from numpy.typing import NDArray
+
+# Poses this close are the same, metres and rad.
+_SAME_PLACE = 0.25
+SAME_YAW = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """H poses T_map_base: rotations, unit complex numbers (H,), and places x + iy (H,), metres."""
+
+    rotation: Complex
+    place: Complex
+
+    def __getitem__(self, index: NDArray[np.intp] | list[int]) -> Poses:
+        return Poses(self.rotation[index], self.place[index])
+
+    def pose(self, index: int) -> Pose2:
+        """One of them."""
+        place, rotation = complex(self.place[index]), complex(self.rotation[index])
+        return Pose2(place.real, place.imag, math.atan2(rotation.imag, rotation.real))
+
+
+def same_pose(a: Pose2, b: Pose2) -> bool:
+    """Whether two poses are close enough to converge to one."""
+    return (math.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
+            and abs(math.remainder(a.yaw - b.yaw, 2.0 * math.pi)) < SAME_YAW)
+
+
+def one_of_each(poses: Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Of poses in an order (H,) the first in each cell of places and headings."""
+    cells = np.rint(np.stack([
+        poses.place.real / _SAME_PLACE, poses.place.imag / _SAME_PLACE,
+        np.angle(poses.rotation) / SAME_YAW])[:, order]).astype(np.int64)
+    # Cells in a row: a map has far fewer than this a side.
+    _, first = np.unique(cells[0] + (cells[1] << 20) + (cells[2] << 40), return_index=True)
+    return order[np.sort(first)]
+
+
+def distinct(poses: Poses, score: Array) -> list[int]:
+    """The best of each group of poses that are the same, best first."""
+    order = np.argsort(-score, kind='stable')
+    place, rotation = poses.place[order], poses.rotation[order]
+    same = np.abs(place - place[:, None]) < _SAME_PLACE
+    same &= (rotation * rotation[:, None].conj()).real > math.cos(SAME_YAW)
+    found: list[int] = []
+    left = np.ones(len(order), dtype=bool)
+    while left.any():
+        first = int(left.argmax())
+        found.append(int(order[first]))
+        left &= ~same[first]
+    return found

@@ -1,0 +1,153 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How well poses explain the strips of an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.many_poses import Poses
+from nccs_pose.estimation.nearest_lines import NearestLines
+from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, StripLines
+from nccs_pose.geometry.floor_scale import FloorScale
+from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.small_matrices import definite_solutions
+import numpy as np
+from numpy.typing import NDArray
+
+_ROUNDS = 2
+# Samples on each strip and on what is near of each map line.
+_SAMPLES = 12
+# No sample of a line counts for more than this, px of the image.
+_LONGEST_SAMPLE = 60.0
+# Fewer samples than this on lines refine no pose.
+_LEAST_SAMPLES = 4
+# What keeps a direction that no sample fixes where it is.
+_DAMPING = 1e-6 * np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A map, and how the rig sees its floor."""
+
+    lines: FloorLines
+    nearest: NearestLines
+    scale: FloorScale
+
+
+class StripScorer:
+    """How well poses explain the strips of one image."""
+
+    def __init__(self, segments: tuple[FloorSegment, ...], place: Place) -> None:
+        self.segments = segments
+        self.strips = strips = StripLines(segments)
+        self._lines, self._nearest, self._scale = place.lines, place.nearest, place.scale
+        footprint, weight, pitch = np.array(
+            [(s.footprint, s.weight, s.pitch) for s in segments]).T
+        share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        self._share = share
+        self._points = (strips.start[:, None] + (
+            strips.length * strips.direction)[:, None] * share).ravel()
+        self._weight = np.repeat(weight / weight.sum() / _SAMPLES, _SAMPLES)
+        tolerance = 0.06 + 1.5 * footprint
+        self._tolerance = np.repeat(tolerance, _SAMPLES)
+        self._pixels_per_metre = np.repeat(pitch / np.maximum(footprint, 1e-9), _SAMPLES)
+        self._layer = np.repeat(place.nearest.layers(strips.colour), _SAMPLES)
+        # Where a point x, y, 1 is along each strip and across it, within 1 if it lies in it.
+        frames = np.stack([strips.direction / (0.5 * strips.length + BEYOND),
+                           1j * strips.direction / tolerance])
+        self._frames = np.stack([
+            frames.real, frames.imag, -(frames * strips.middle.conj()).real],
+            axis=2).reshape(-1, 3).astype(np.float32)
+
+    def _on_lines(
+        self, poses: Poses, step: int = 1,
+    ) -> tuple[NDArray[np.bool_], NDArray[np.intp], Array]:
+        """Whether each sample (H, P) lies on a map line, which one, and how far off it.
+
+        :param step: look at one sample out of so many.
+        """
+        some = slice(step // 2, None, step)
+        points = poses.rotation[:, None] * self._points[some] + poses.place[:, None]
+        which, across = self._nearest.at(points, self._layer[some])
+        return np.abs(across) < self._tolerance[some], which, across
+
+    def claimed(self, poses: Poses, step: int = 1) -> Array:
+        """Fraction of the strips' pixels on map lines (H,), by one sample out of ``step``."""
+        on, _, _ = self._on_lines(poses, step)
+        weight = self._weight[step // 2::step]
+        return on @ (weight / weight.sum())
+
+    def explained(self, poses: Poses, step: int = 1) -> Array:
+        """Fraction of the map lines in view that strips lie on (H,).
+
+        :param step: look at one sample of each line out of so many.
+        """
+        lines, share = self._lines, self._share[step // 2::step]
+        # Of each line only what is within reach.
+        foot = poses.place + poses.rotation * self._scale.foot
+        seen = (foot[:, None] - lines.start) * lines.direction.conj()
+        half = np.sqrt(np.maximum(self._scale.reach**2 - np.square(seen.imag), 0.0))
+        first = np.maximum(seen.real - half, 0.0)
+        length = np.minimum(seen.real + half, lines.length) - first
+        pose, line = np.nonzero(length > 0.0)
+        first, length = first[pose, line], length[pose, line]
+        to_base = poses.rotation[pose].conj()
+        along = lines.direction[line] * to_base
+        begin = (lines.start[line] - poses.place[pose]) * to_base + first * along
+        points = begin[:, None] + (length * along)[:, None] * share
+        # A metre of tape far away fills fewer pixels: count it by its length in the image.
+        weight = np.minimum(
+            self._scale.pixels(points, (length / _SAMPLES * along)[:, None]), _LONGEST_SAMPLE)
+        at = np.ones((3, *points.shape), np.float32)
+        at[0], at[1] = points.real, points.imag
+        off = self._frames @ at.reshape(3, -1)
+        inside = np.abs(off, out=off) < 1.0
+        on = (inside[:len(inside) // 2] & inside[len(inside) // 2:]).any(axis=0)
+        covered = weight * on.reshape(weight.shape)
+        count = len(poses.place)
+        total = np.bincount(pose, weight.sum(axis=1), count)
+        return np.bincount(pose, covered.sum(axis=1), count) / np.maximum(total, 1e-9)
+
+    def refined(self, poses: Poses) -> tuple[Poses, Array, Array]:
+        """Lay the strips on their lines by least squares on the floor, from poses (H,).
+
+        :returns: the poses, the fraction of the strips' pixels on map lines (H,), and the root
+            mean square distance of these (H,), px; 0 if none is on any. Of a last step that is
+            small enough both are as it says that they will be.
+        """
+        inverse = 1.0 / self._tolerance
+        count = len(poses.place)
+        rows = np.empty((count, 4, len(inverse)))
+        for _ in range(_ROUNDS):
+            on, which, across = self._on_lines(poses)
+            weight = on * inverse
+            normal = self._nearest.normal.take(which) * weight
+            turned = poses.rotation[:, None] * self._points
+            # Derivatives of the distances by x, y and yaw, and the distances.
+            rows[:, 0], rows[:, 1] = normal.real, normal.imag
+            rows[:, 2] = (normal * turned.conj()).imag
+            np.multiply(across, weight, out=rows[:, 3])
+            products = rows @ rows.transpose(0, 2, 1)
+            step = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
+            step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
+            poses = Poses(poses.rotation * np.exp(-1j * step[:, 2]),
+                           poses.place - step[:, 0] - 1j * step[:, 1])
+        across -= (step[:, None] @ rows[:, :3])[:, 0] * self._tolerance
+        on &= np.abs(across) < self._tolerance
+        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
+        total = on @ self._weight
+        return poses, total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
