@@ -92,9 +92,9 @@ class Associator:
             poses, guessed = _promising(scorer, poses, told)
         poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
-        refined = [
-            FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]), float(misfit[k]))
-            for k in distinct(poses, score)]
+        found = distinct(poses, score)
+        refined = [FittedCandidate(*of) for of in zip(
+            poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
         return tuple(sorted((*refined, *guessed), key=lambda c: -c.score))
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
@@ -131,9 +131,9 @@ def _promising(
     poses, claimed, there = poses[best], claimed[best], there[best]
     score = _harmonic(claimed, scorer.explained(poses, _COARSE))
     found = sorted(distinct(poses, score), key=lambda k: not there[k])
-    return poses[found[:_REFINED]], [
-        FittedCandidate(poses.pose(k), float(score[k]), float(claimed[k]))
-        for k in found[_REFINED:]]
+    others = found[_REFINED:]
+    return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
+        poses[others].listed(), score[others].tolist(), claimed[others].tolist())]
 
 
 def _harmonic(a: Array, b: Array) -> Array:

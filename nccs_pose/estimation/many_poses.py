@@ -39,10 +39,10 @@ class Poses:
     def __getitem__(self, index: NDArray[np.intp] | list[int]) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
-    def pose(self, index: int) -> Pose2:
-        """One of them."""
-        place, rotation = complex(self.place[index]), complex(self.rotation[index])
-        return Pose2(place.real, place.imag, math.atan2(rotation.imag, rotation.real))
+    def listed(self) -> list[Pose2]:
+        """Each of them."""
+        place, yaw = self.place, np.angle(self.rotation)
+        return [Pose2(*at) for at in zip(place.real.tolist(), place.imag.tolist(), yaw.tolist())]
 
 
 def same_pose(a: Pose2, b: Pose2) -> bool:
@@ -65,12 +65,12 @@ def distinct(poses: Poses, score: Array) -> list[int]:
     """The best of each group of poses that are the same, best first."""
     order = np.argsort(-score, kind='stable')
     place, rotation = poses.place[order], poses.rotation[order]
-    same = np.abs(place - place[:, None]) < _SAME_PLACE
+    apart = place - place[:, None]
+    same = np.square(apart.real) + np.square(apart.imag) < _SAME_PLACE**2
     same &= (rotation * rotation[:, None].conj()).real > math.cos(SAME_YAW)
-    found: list[int] = []
     left = np.ones(len(order), dtype=bool)
-    while left.any():
-        first = int(left.argmax())
-        found.append(int(order[first]))
-        left &= ~same[first]
-    return found
+    # Most are like no other.
+    for k in (same.sum(axis=1) > 1).nonzero()[0].tolist():
+        if left[k]:
+            left[k + 1:] &= ~same[k, k + 1:]
+    return [int(k) for k in order[left]]

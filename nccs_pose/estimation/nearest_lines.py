@@ -55,7 +55,7 @@ class NearestLines:
         # Round it all there is a frame of cells near to no line.
         self._origin, self._scale = low - cell * (1.0 + 1.0j), 1.0 / cell
         shape = (math.ceil(size.imag / cell) + 2, math.ceil(size.real / cell) + 2)
-        self._last = np.array([shape[1] - 1.0, shape[0] - 1.0])
+        self._last = (shape[1] - 1.0, shape[0] - 1.0)
         self._columns, self._cells = shape[1], shape[0] * shape[1]
         # Of each cell the nearest line, and the next if that may be nearer to some of its points.
         nearest = np.full((2, len(self._colours), *shape), len(lines.length), np.int16)
@@ -93,13 +93,12 @@ class NearestLines:
 
         :param layer: of each point (P,).
         """
-        place = ((points - self._origin) * self._scale).view(np.float64)
-        place = place.reshape(*points.shape, 2)
-        np.maximum(place, 0.0, out=place)
-        np.minimum(place, self._last, out=place)
-        cell = place.astype(np.intp)
-        index = cell[..., 1] * self._columns
-        index += cell[..., 0]
+        place = (points - self._origin) * self._scale
+        column, row = (
+            np.minimum(np.maximum(part, 0.0), last).astype(np.intp)
+            for part, last in zip((place.real, place.imag), self._last))
+        index = row * self._columns
+        index += column
         index += layer
         which = self._nearest.take(index, axis=1)
         across = (points * self._to_line.take(which)).real

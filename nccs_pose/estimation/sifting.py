@@ -40,8 +40,9 @@ import numpy as np
 _TRIED = 6
 # They lie within this of the truth in the image, px.
 _SEARCH_BAND = 5.0
-# Only those count that score this fraction of the best.
-_WORTH_TRYING = 0.6
+# Only those count that score this fraction of the best, or are where the robot should be: one that
+# holds is the best by strips or nearly so (0.93 of its score or more, of a thousand that held).
+_WORTH_TRYING = 0.75
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
@@ -126,7 +127,8 @@ class Sifter:
             self._symmetries, told, self._options.ambiguity_ratio, candidates[_TRIED:])
         starts = deque(_Start(h.pose, self._options.band) for h in hypotheses)
         starts += (_Start.of(c) for c in candidates[:_TRIED]
-                   if c.score >= _WORTH_TRYING * case.sight.promise)
+                   if c.score >= _WORTH_TRYING * case.sight.promise
+                   or (told is not None and told.holds(c.pose)))
         undecided = False
         while starts:
             start = starts.popleft()
