@@ -157,6 +157,32 @@ def test_noise_twice_as_strong_doubles_sigma() -> None:
     assert medians[2] / medians[1] == pytest.approx(2.0, rel=0.25)
 
 
+@pytest.mark.parametrize('blur', [1.5, 2.5])
+@pytest.mark.parametrize('half_width', [0.7, 3.0])
+@pytest.mark.parametrize('inwards', [1.0, -1.0])
+def test_a_blurred_bend_is_measured_where_it_is(
+        blur: float, half_width: float, inwards: float) -> None:
+    radius, middle, finer = 55.0, np.array([0.5 * WIDTH + 0.31, 0.5 * HEIGHT - 0.17]), 4
+    v, u = (np.mgrid[0:HEIGHT * finer, 0:WIDTH * finer] + 0.5) / finer - 0.5
+    ring = np.abs(np.hypot(u - middle[0], v - middle[1]) - radius) < half_width
+    share = ring.reshape(HEIGHT, finer, WIDTH, finer).mean(axis=(1, 3))
+    share = cv2.GaussianBlur(share, (0, 0), blur)
+    image = np.rint(FLOOR + share[..., None] * (GREEN - FLOOR)).astype(np.uint8)
+    n = 168
+    angle = 2.0 * np.pi * np.arange(n) / n
+    outwards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centre = middle + radius * outwards
+    bands = Bands(
+        centre, centre, -inwards * outwards, np.full(n, inwards / radius), np.full(n, half_width),
+        np.full(n, 2.0 * np.pi * radius / n), np.zeros(n, dtype=np.intp), 8)
+    colour = _colour()
+    for _ in range(6):
+        fit, colour = fit_profiles(image, bands, colour)
+    assert fit.found.all()
+    # Uncorrected it would be half the squared blur over the radius, inwards.
+    assert abs(fit.shift.mean()) < 0.15 * 0.5 * blur**2 / radius
+
+
 @pytest.mark.parametrize('blur', [0.5, 1.0, 1.8])
 @pytest.mark.parametrize('half_width', [1.5, 4.0])
 def test_the_blur_of_the_edges_is_learned(blur: float, half_width: float) -> None:

@@ -113,8 +113,10 @@ def fit_profiles(
             weights @ system.height, weights @ system.rest[3, 4:], system.rest[3, 3])
     # An edge moves a template softer than itself by more than the template thinks.
     gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
+    # Blur draws a bent edge towards the inside of the bend.
+    drawn = 0.5 * colour.blur**2 * bands.bend
     return ProfileFit(
-        gain * fit.shift, gain * fit.sigma, fit.found), colour
+        gain * fit.shift - drawn, gain * fit.sigma, fit.found), colour
 
 
 class _System(NamedTuple):
