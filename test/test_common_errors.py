@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from nccs_pose.estimation.common_errors import common_misfit, correlation_factor
+from nccs_pose.estimation.common_errors import common_misfit, common_variance
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -31,29 +31,29 @@ ALONG = np.tile(np.linspace(-1.0, 1.0, PER_LINE), LINES)
 POSE = np.linalg.qr(np.stack([
     np.where(LABEL == 0, 1.0, 0.0) - np.where(LABEL == 2, 1.0, 0.0),
     np.where(LABEL == 1, 1.0, 0.0) - np.where(LABEL == 3, 1.0, 0.0), ALONG], axis=1))[0]
+LEVERAGE = np.square(POSE).sum(axis=1)
 
 
 def _squared_errors(b: list[float], a: list[float], trials: int = 600) -> tuple[float, float]:
     """Errors that run through the filter b / a along each line, from white noise.
 
-    :returns: mean factor, and the mean square of what a pose takes out, in units of the variance
-        that the residuals and the factor claim for it; 1 where they are right.
+    :returns: mean variance claimed, in units of that of a single error, and the mean square of
+        what a pose takes out, in units of the variance claimed for it; 1 where that is right.
     """
     rng, found = np.random.default_rng(3), []
+    white = lfilter(b, a, np.eye(1, 200)[0])
     for _ in range(trials):
         error = lfilter(b, a, rng.standard_normal((LINES, 2 * PER_LINE)))[:, PER_LINE:].ravel()
         taken = POSE.T @ error
-        residual = error - POSE @ taken
-        factor = correlation_factor(residual, LABEL, 3)
-        claimed = factor * (residual @ residual) / (len(residual) - 3)
-        found.append((factor, np.mean(taken**2) / claimed))
-    factor, nees = np.mean(found, axis=0)
-    return float(factor), float(nees)
+        claimed = common_variance(error - POSE @ taken, LEVERAGE, LABEL)
+        found.append((claimed / (white @ white), np.mean(taken**2) / claimed))
+    claimed, nees = np.mean(found, axis=0)
+    return float(claimed), float(nees)
 
 
 def test_independent_errors_are_told_as_such() -> None:
-    factor, nees = _squared_errors([1.0], [1.0])
-    assert factor == pytest.approx(1.0, abs=0.06)
+    variance, nees = _squared_errors([1.0], [1.0])
+    assert variance == pytest.approx(1.0, abs=0.06)
     # Of 1800 squares.
     assert nees == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 1800.0))
 
@@ -69,9 +69,9 @@ def test_what_neighbours_share_or_take_from_each_other_is_counted(
     # Long sums of filtered noise have the variance of the filter's gain at rest.
     white = lfilter(b, a, np.eye(1, 200)[0])
     true = float(white.sum() ** 2 / (white @ white))
-    factor, nees = _squared_errors(b, a)
+    variance, nees = _squared_errors(b, a)
     assert abs(true - 1.0) > 0.3
-    assert factor == pytest.approx(true, rel=0.25)
+    assert variance == pytest.approx(true, rel=0.25)
     assert nees == pytest.approx(1.0, abs=0.25)
 
 
@@ -81,24 +81,40 @@ def test_what_neighbours_share_or_take_from_each_other_is_counted(
 ])
 def test_what_many_neighbours_share_is_rather_overrated(b: list[float], a: list[float]) -> None:
     white = lfilter(b, a, np.eye(1, 200)[0])
-    factor, nees = _squared_errors(b, a)
-    assert factor > float(white.sum() ** 2 / (white @ white))
+    variance, nees = _squared_errors(b, a)
+    assert variance > float(white.sum() ** 2 / (white @ white))
     assert nees < 1.0
 
 
+@pytest.mark.parametrize(('near', 'far'), [(1.5, 0.5), (0.5, 1.5)])
+def test_errors_count_by_what_they_do_to_the_pose(near: float, far: float) -> None:
+    # Two lines tell of the pose; the others are as many stations, but far away.
+    tells = LABEL < 2
+    pose = np.linalg.qr(POSE * np.where(tells, 1.0, 0.1)[:, None])[0]
+    leverage = np.square(pose).sum(axis=1)
+    rng, squares = np.random.default_rng(6), []
+    for _ in range(600):
+        error = np.where(tells, near, far) * rng.standard_normal(len(LABEL))
+        taken = pose.T @ error
+        squares.append(np.mean(taken**2) / common_variance(
+            error - pose @ taken, leverage, LABEL))
+    assert np.mean(squares) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 1800.0))
+
+
 def test_ends_of_two_lines_are_no_neighbours() -> None:
-    label = np.repeat([0, 1], 30)
+    label, leverage = np.repeat([0, 1], 30), np.full(60, 0.05)
     residual = np.random.default_rng(5).standard_normal(60)
     turned = residual.copy()
     turned[:30] *= -1.0
     # Only products of one line with the other change their sign.
-    assert correlation_factor(turned, label, 3) == pytest.approx(
-        correlation_factor(residual, label, 3), rel=1e-12)
+    assert common_variance(turned, leverage, label) == pytest.approx(
+        common_variance(residual, leverage, label), rel=1e-12)
 
 
 def test_few_residuals_are_no_obstacle() -> None:
     label = np.array([0, 1, 1, 2, 2, 2])
-    assert 1.0 < correlation_factor(np.full(6, 0.5), label, 3) <= math.exp(2.4)
+    claimed = common_variance(np.full(6, 0.5), np.full(6, 0.5), label)
+    assert 0.5 < claimed < 6.0
     assert common_misfit(np.full(6, 0.5), np.full(6, 0.1), label) == 0.0
 
 

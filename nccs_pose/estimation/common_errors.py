@@ -25,17 +25,17 @@ from numpy.typing import NDArray
 
 # Stations farther apart than this many share little; their products would only add noise.
 _LAGS = 2
-# What the factor's own uncertainty weighs: one unknown in theory where errors are independent,
-# more where they are not; found on simulated images (as was the exponential).
-_UNCERTAIN = 2
+# What the estimate's own uncertainty weighs, in unknowns: 1/2 for the variance, 1 for the
+# correlations where errors are independent.
+_UNCERTAIN = 1.5
 # From few stations the correlation is not known; the claim is widened or narrowed no further.
 _LIMIT = 1.2
 # So many neighbours may share one cause of misfit (a block of JPEG, a tile).
 _BLOCK = 4
 
 
-def correlation_factor(residual: Array, label: NDArray[np.intp], unknowns: int) -> float:
-    """How much more the sum of many stations' errors varies than if they were independent.
+def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -> float:
+    """Variance per station of what the errors of many stations add up to in a fit.
 
     Neighbours err alike where a texture or a block of JPEG spans several, and against each other
     where the pixels' grid lies on the template in turns. With correlations c_k between stations k
@@ -45,26 +45,34 @@ def correlation_factor(residual: Array, label: NDArray[np.intp], unknowns: int) 
     coarse JPEG), whole lines have too, which the pose takes for its own so that no residual shows
     it. On simulated images of all kinds squared errors of poses were what it says, to an eighth.
 
-    What the fit takes out of the residuals is what they have in common: each unknown, one in N of
-    their variance times this factor, from every c_k alike. A few more stand for the uncertainty
-    of the factor itself, which makes the inverse of a covariance too large on average.
+    Errors weigh what they do in the fit. A near tape tells most of a pose, and compared with the
+    noise told it may err more than a far one (coarse JPEG, whose far tapes are all template) or
+    less (a texture seen finely): the mean over all stations would be that of the far ones, which
+    are many.
+
+    What the fit takes out of the residuals is what they have in common: the stations' leverage,
+    times this variance, from each square and each product. A little more stands for the
+    uncertainty of the estimate, which makes the inverse of a covariance too large on average.
 
     :param residual: of the stations (N,), whitened, along each line in order.
+    :param leverage: how far each one's error moves its own fit (N,), from 0 to 1.
     :param label: line (N,), ascending.
-    :param unknowns: how many have been fitted.
-    :returns: 1 for independent errors, from exp(-2.4) to exp(2.4).
+    :returns: 1 for independent errors as large as told; from exp(-2.4) to exp(2.4) times what
+        independent errors of their size would come to.
     """
-    variance = max(_square(residual) / max(1, len(residual) - unknowns), 1e-12)
-    correlation = 0.0
+    fitted = max(float(leverage.sum()), 1e-12)
+    taken = float(leverage @ leverage) / fitted
+    weighed = residual * np.sqrt(leverage)
+    variance = max(_square(weighed) / (fitted * max(1.0 - taken, 1e-12)), 1e-12)
+    products = 0.0
     for lag in range(1, _LAGS + 1):
-        along = label[lag:] == label[:-lag]
-        products = float((residual[lag:] * residual[:-lag]) @ along)
-        correlation += products / max(1, int(np.count_nonzero(along))) / variance
-    taken = _LAGS * (unknowns + _UNCERTAIN) / max(1, len(residual))
-    exponent = correlation
+        products += float((weighed[lag:] * weighed[:-lag]) @ (label[lag:] == label[:-lag]))
+    shown = products / (fitted * variance)
+    taken *= _LAGS * (1.0 + _UNCERTAIN / fitted)
+    correlation = shown
     for _ in range(2):
-        exponent = min(correlation + taken * math.exp(2.0 * exponent), _LIMIT)
-    return math.exp(2.0 * max(exponent, -_LIMIT))
+        correlation = min(shown + taken * math.exp(2.0 * correlation), _LIMIT)
+    return variance * math.exp(2.0 * max(correlation, -_LIMIT))
 
 
 def common_misfit(residual: Array, sigma: Array, label: NDArray[np.intp]) -> float:

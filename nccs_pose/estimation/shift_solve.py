@@ -21,7 +21,7 @@ pose; who predicts again at the pose found makes it exact.
 
 from __future__ import annotations
 
-from nccs_pose.estimation.common_errors import correlation_factor
+from nccs_pose.estimation.common_errors import common_variance
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import definite_solution, inverse
@@ -94,10 +94,10 @@ def solve_shifts(
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
     e = _residual(inliers, unknowns)
-    correlation = correlation_factor(e, label.take(at), len(free))
-    inflation = correlation * _inflation(e, len(free))
-    covariance = definite_solution(
-        normal / inflation + known, _ONE[:len(free), :len(free)])
+    one = _ONE[:len(free), :len(free)]
+    leverage = (definite_solution(normal + known, one) @ inliers[:-1] * inliers[:-1]).sum(axis=0)
+    inflation = max(common_variance(e, leverage, label.take(at)) / _WITHIN_GATE, 1e-6)
+    covariance = definite_solution(normal / inflation + known, one)
     unknowns = covariance @ (right / inflation + told)
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift[inlier] / sigma[inlier, None]
@@ -163,12 +163,6 @@ def _prior(
 def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
     """Of equations (K + 1, N) at the unknowns (K,)."""
     return rows[-1] - unknowns @ rows[:-1]
-
-
-def _inflation(residual: Array, unknowns: int) -> float:
-    """Variance of the inlying stations' residuals (N,) against the noise told."""
-    degrees = max(1, len(residual) - unknowns)
-    return max(1e-6, float(residual @ residual) / (_WITHIN_GATE * degrees))
 
 
 def _robust_variance(square: Array) -> float:
