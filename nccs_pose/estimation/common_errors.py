@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 # Stations farther apart than this many share little; their products would only add noise.
 _LAGS = 2
-# What the estimate's own uncertainty weighs, in unknowns: 1/2 for the variance, 1 for the
-# correlations where errors are independent.
-_UNCERTAIN = 1.5
+# What the estimate's own uncertainty weighs: one unknown more makes the mean of its inverse right
+# where errors are independent.
+_UNCERTAIN = 1
 # From few stations the correlation is not known; the claim is widened or narrowed no further.
 _LIMIT = 1.2
 # So many neighbours may share one cause of misfit (a block of JPEG, a tile).
