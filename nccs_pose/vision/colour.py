@@ -86,7 +86,7 @@ class LineColour:
     def discriminant(self) -> Array:
         """Fisher's weights (3,) on B, G, R, scaled so that the tape's contrast is 1."""
         weights = solution(self.clutter, self.contrast)
-        return weights / float(weights @ self.contrast)
+        return weights / float(weights.dot(self.contrast))
 
     def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over the contrast seen at N stations and the variation that is no tape's.
@@ -98,12 +98,12 @@ class LineColour:
         :param clutter: covariance of what no profile explains (3, 3, N), grey levels^2.
         :param floor: the floor's colour (3,), grey levels.
         """
-        along = self.discriminant @ height
+        along = self.discriminant.dot(height)
         total = float(power.sum())
-        mean = float(power @ along) / total
+        mean = float(power.dot(along)) / total
         # Those of mere noise that happen to be positive would pass for a faint tape.
         scatter = power * (along - mean)
-        if mean < _EVIDENT * math.sqrt(float(scatter @ scatter)) / total:
+        if mean < _EVIDENT * math.sqrt(float(scatter.dot(scatter))) / total:
             return self
         ordered, middle = along.copy(), len(along) // 2
         ordered.partition(middle)
@@ -113,15 +113,15 @@ class LineColour:
             return self
         weight = power * good
         return self.taught(
-            height @ weight / weight.sum(),
-            (clutter.reshape(9, -1) @ good).reshape(3, 3) / count, floor)
+            height.dot(weight) / weight.sum(),
+            clutter.reshape(9, -1).dot(good).reshape(3, 3) / count, floor)
 
     def taught(self, contrast: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over a contrast (3,) to a floor's colour (3,), unless it is not of this class.
 
         :param clutter: covariance of the floor (3, 3), grey levels^2.
         """
-        if self._unlike(contrast, floor) or float(contrast @ contrast) < _LEAST_CONTRAST**2:
+        if self._unlike(contrast, floor) or float(contrast.dot(contrast)) < _LEAST_CONTRAST**2:
             return self
         return LineColour(self.name, contrast, clutter + _ROUNDING, self.blur)
 
@@ -143,7 +143,7 @@ class LineColour:
     def _coloured(self) -> bool:
         return abs(sum(CONTRASTS[self.name])) < 1e-9
 
-    def sharpen(self, height: Array, left: Array, power: Array) -> LineColour:
+    def sharpen(self, height: Array, left: Array, power: Array, unit: float) -> LineColour:
         """Take over the blur seen at N stations.
 
         A profile that is softer than its template leaves a residual along dT/d(blur), in
@@ -153,12 +153,13 @@ class LineColour:
         :param left: product of the stations' profile with dT/d(blur), the template itself taken
             out of it (N,).
         :param power: of that with itself (N,).
+        :param unit: what the derivative has been multiplied by, px.
         """
         height = np.maximum(height, 0.0)
-        total = float((height * height) @ power)
+        total = float((height * height).dot(power))
         if total < 1e-9:
             return self
-        step = min(max(float(height @ left) / total, -_BLUR_STEP), _BLUR_STEP)
+        step = min(max(unit * float(height.dot(left)) / total, -_BLUR_STEP), _BLUR_STEP)
         least, most = _BLUR_RANGE
         return LineColour(
             self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most))

@@ -94,24 +94,27 @@ def profile_products(
     """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
-    is the profile, D = dT/d(delta) and B = dT/d(blur).
+    is the profile, D = dT/d(delta) and B = dT/d(blur), both times sqrt(2 pi) blur: for shifts and
+    changes of the blur in :func:`unit`.
 
     :param pixels: (N, P, 3) BGR.
     :param s: their place across the curve (N, P), px.
     :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (7, 8, G); those with D of each station (8, N); and the floor's colour
-        (3,), which the channels are less.
+        over each group (7, 8, G); those with D of each station (8, N); and the colour (3,) that
+        the channels are less, about that of the floor.
     """
     n, count = s.shape
-    floor = cv2.reduce(pixels[:, :1], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
-    place, wide = s * np.float32(1.0 / blur), (half_width / blur).astype(np.float32)[:, None]
-    edges = np.empty((2, n, count), np.float32)
+    rows = np.empty((8, n, count), np.float32)
+    # What is filled last lends its place before: the less memory, the more of it is at hand.
+    rise, place, edges, square = rows[:2], rows[2], rows[4:6], rows[6:8]
+    np.multiply(s, np.float32(1.0 / blur), out=place)
+    wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
-    square = np.square(edges)
+    np.square(edges, out=square)
     # The logistic function of a cubic is the normal distribution to 0.0003.
-    rise = square * np.float32(-0.0713548)
+    np.multiply(square, np.float32(-0.0713548), out=rise)
     rise -= np.float32(1.5957692)
     rise *= edges
     _exponentiate(rise)
@@ -120,23 +123,25 @@ def profile_products(
     square *= np.float32(-0.5)
     steep = _exponentiate(square)
     edges *= steep
-    rows = np.empty((8, n, count), np.float32)
     np.subtract(rise[0], rise[1], out=rows[0])
     np.subtract(steep[1], steep[0], out=rows[1])
     rows[2] = s
     np.subtract(edges[1], edges[0], out=rows[3])
-    # Numbers about zero keep their digits in sums of squares.
-    np.subtract(pixels.transpose(2, 0, 1), floor[:, None, None], out=rows[4:7])
+    # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
+    less = pixels[0, 0].astype(np.float32)
+    np.subtract(pixels.transpose(2, 0, 1), less[:, None, None], out=rows[4:7])
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     grouped = rows.reshape(8, -1, members * count)
     pooled = grouped[:7].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
     by_shift = (rows.transpose(1, 0, 2) @ rows[1, :, :, None])[..., 0]
-    steepness = 1.0 / (math.sqrt(2.0 * math.pi) * blur)
-    scale = np.array([1.0, steepness, 1.0, steepness, 1.0, 1.0, 1.0, 1.0])
-    return (np.multiply(
-        pooled.transpose(1, 2, 0), scale[:7, None, None] * scale[:, None], order='C'),
-            np.multiply(by_shift.T, (steepness * scale)[:, None], order='C'), floor)
+    return (pooled.transpose(1, 2, 0).astype(float, order='C'),
+            by_shift.T.astype(float, order='C'), less)
+
+
+def unit(blur: float) -> float:
+    """What a unit of a template's derivative stands for, px."""
+    return math.sqrt(2.0 * math.pi) * blur
 
 
 def _exponentiate(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -31,7 +31,7 @@ from typing import NamedTuple
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.profile_products import profile_products, read_pixels
+from nccs_pose.vision.profile_products import profile_products, read_pixels, unit
 import numpy as np
 from numpy.typing import NDArray
 
@@ -92,27 +92,25 @@ def fit_profiles(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
     pixels, s = read_pixels(image, bands, margin, rows)
-    pooled, by_shift, floor = profile_products(pixels, s, bands.half_width, blur, bands.members)
+    pooled, by_shift, less = profile_products(pixels, s, bands.half_width, blur, bands.members)
     count = s.shape[1]
-    size = bands.members * count
-    means = pooled[:, 7] / size
-    system = _eliminated(pooled[:, :7] - means[:, None] * pooled[:, 7], size)
+    system = _eliminated(pooled, bands.members * count)
     if not rough:
+        floor = less + system.floor.sum(axis=1) / system.floor.shape[1]
         colour = colour.learn(system.height, system.power, system.left, floor)
     # Where the grid is finer than the pixels, across or along, each is counted several times.
     half_width = bands.half_width[::bands.members]
     repeats = np.maximum(rows / bands.spacing[::bands.members], 1.0) * np.maximum(
         0.5 * count / rows / (half_width + margin), 1.0)
-    fit, shared = _shifts(
-        by_shift, means, system, colour.discriminant, repeats, bands.label[::bands.members],
+    fit, shared, height, softness = _shifts(
+        pooled, by_shift, system, colour.discriminant, repeats, bands.label[::bands.members],
         half_width)
+    step = unit(blur)
     # A template beside its tape would take the misfit for blur.
-    if not rough and median(np.abs(shared)) < _SHARP_PX:
-        weights = colour.discriminant
-        colour = colour.sharpen(
-            weights @ system.height, weights @ system.rest[3, 4:], system.rest[3, 3])
+    if not rough and step * median(np.abs(shared)) < _SHARP_PX:
+        colour = colour.sharpen(height, softness, system.swept[3, 3], step)
     # An edge moves a template softer than itself by more than the template thinks.
-    gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
+    gain = step * math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
     # Blur draws a bent edge towards the inside of the bend.
     drawn = 0.5 * colour.blur**2 * bands.bend
     return ProfileFit(
@@ -120,18 +118,17 @@ def fit_profiles(
 
 
 class _System(NamedTuple):
-    """The normal equations of G groups after elimination: contrast, floor's slope, shift.
+    """The normal equations of G groups after elimination: mean, contrast, floor's slope, shift.
 
     :ivar power: of T (G,).
-    :ivar shares: what a unit of T, D, s, B and the channels has of T (7, G).
-    :ivar rest: what is then left of their products with each other (7, 7, G).
+    :ivar swept: of T, D, s, B and the channels (columns) what mean and T leave of their products
+        with each other (7 rows), then what they have of T and of 1 (9, 7, G).
     :ivar slope_power: of s in that (G,), and so of D, ``own_power``.
     :ivar left: covariance of the channels that no template explains (3, 3, G).
     """
 
     power: Array
-    shares: Array
-    rest: Array
+    swept: Array
     slope_power: Array
     own_power: Array
     left: Array
@@ -139,18 +136,27 @@ class _System(NamedTuple):
     @property
     def height(self) -> Array:
         """Contrast of each channel (3, G)."""
-        return self.shares[4:]
+        return self.swept[7, 4:]
+
+    @property
+    def floor(self) -> Array:
+        """What each channel is beside the tape (3, G)."""
+        return self.swept[8, 4:]
 
 
-def _eliminated(products: Array, size: int) -> _System:
-    """Eliminate T from the rest, and all three from the channels.
+def _eliminated(pooled: Array, size: int) -> _System:
+    """Eliminate mean and T from the rest, and all four from the channels.
 
-    :param products: of T, D, s, B and the channels with each other (7, 7, G).
+    :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
     :param size: samples of each group.
     """
+    means = pooled[:, 7] / size
+    products = pooled[:, :7] - means[:, None] * pooled[:, 7]
     power = np.maximum(products[0, 0], 1e-9)
-    shares = products[0] / power
-    rest = products - shares[:, None] * products[0]
+    swept = np.empty((9, *products.shape[1:]))
+    rest, shares = swept[:7], np.divide(products[0], power, out=swept[7])
+    np.subtract(products, shares[:, None] * products[0], out=rest)
+    np.subtract(means, shares * means[0], out=swept[8])
     slope_power = np.maximum(rest[2, 2], 1e-9)
     own_power = np.maximum(rest[1, 1], 1e-9)
     crossed, slope, own = rest[1, 2], rest[2, 4:], rest[1, 4:]
@@ -159,61 +165,75 @@ def _eliminated(products: Array, size: int) -> _System:
     alone_power = np.maximum(own_power - share * crossed, 1e-9)
     left = (rest[4:, 4:] - slope[:, None] * (slope / slope_power)
             - alone[:, None] * (alone / alone_power))
-    # Mean, contrast, slope and shift have been fitted.
-    return _System(power, shares, rest, slope_power, own_power, left / (size - 4))
+    return _System(power, swept, slope_power, own_power, left / (size - 4))
+
+
+class _Seen(NamedTuple):
+    """What G groups and their stations say along a colour's discriminant.
+
+    :ivar fit: of the stations.
+    :ivar shared: shift of each group as a whole (G,).
+    :ivar height: contrast of each, whatever its shift (G,).
+    :ivar softness: its product with B, less T (G,).
+    """
+
+    fit: ProfileFit
+    shared: Array
+    height: Array
+    softness: Array
 
 
 def _shifts(
-    by_shift: Array, means: Array, system: _System, weights: Array, repeats: Array,
+    pooled: Array, by_shift: Array, system: _System, weights: Array, repeats: Array,
     label: NDArray[np.intp], half_width: Array,
-) -> tuple[ProfileFit, Array]:
-    """Shifts and their noise along a colour's discriminant.
+) -> _Seen:
+    """Shifts and their noise along a colour's discriminant, in units of D's.
 
-    :param by_shift: products of the stations with D (8, N).
-    :param means: of T, D, s, B and the channels over each group (7, G).
+    :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
+    :param by_shift: the same of the stations with D (8, N).
     :param weights: the discriminant (3,).
     :param repeats: how often each pixel is among the samples of a group (G,).
     :param label: line of each group (G,), ascending.
     :param half_width: of its tape (G,), px.
-    :returns: the stations' fit, and the shift of each group as a whole (G,), px.
     """
-    power, crossed = system.power, system.rest[1, 2]
-    members = by_shift.shape[1] // len(power)
-    own, slope = weights @ system.rest[1:3, 4:]
+    power, swept = system.power, system.swept
+    crossed, members = swept[1, 2], by_shift.shape[1] // len(power)
+    seen = weights @ swept[:, 4:]
+    own, slope = seen[1], seen[2]
     squares = (weights[:, None] * weights).ravel()
-    variance = np.maximum(squares @ system.left.reshape(9, -1), 1e-12)
-    usual = median(variance)
+    variance = squares.dot(system.left.reshape(9, -1))
+    usual = max(median(variance), 1e-12)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
     # A slope of the floor costs a wide tape much of what it tells. How far the slopes of all
     # groups exceed their noise says how much of each is to be believed.
-    excess = float((slope / (system.slope_power * variance)) @ slope) / len(slope) - 1.0
+    excess = float((slope / (system.slope_power * variance)).dot(slope)) / len(slope) - 1.0
     belief = max(excess, 0.0) / (1.0 + max(excess, 0.0))
-    share = belief / system.slope_power
-    share *= crossed
+    believed = belief / system.slope_power
+    share = believed * crossed
     shift_power = np.maximum(system.own_power - share * crossed, 1e-9)
     variance *= repeats
     moved = (own - share * slope) / shift_power
-    a = weights @ system.height - system.shares[1] * moved
+    a = seen[7] - swept[7, 1] * moved
     told = power / variance
     level, certain = _levels(label, a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One group's contrast is noisy where the tape is thin; its neighbours know better.
-    prior = 1.0 / np.square(_CONTRAST_SPREAD * level)
-    smooth = np.maximum((a * told + level * prior) / (told + prior), 1e-9)
+    known = told * np.square(_CONTRAST_SPREAD * level)
+    smooth = np.maximum((a * known + level) / (known + 1.0), 1e-9)
     # What each station's pixels say to D beside the floor and the contrast of its group; the
     # weighted mean over the group is the group's own shift.
-    tilt = belief * slope / system.slope_power - share * moved
-    height = a - system.shares[2] * tilt
-    base = weights @ means[4:] - height * means[0] - moved * means[1] - tilt * means[2]
-    said = (weights @ by_shift[4:7] - height.repeat(members) * by_shift[0]
-            - tilt.repeat(members) * by_shift[2] - base.repeat(members) * by_shift[7])
+    tilt = believed * slope - share * moved
+    height, base = (seen[7:] - swept[7:, 1] * moved - swept[7:, 2] * tilt).repeat(
+        members, axis=1)
+    said = (weights.dot(by_shift[4:7]) - height * by_shift[0]
+            - tilt.repeat(members) * by_shift[2] - base * by_shift[7])
     own_power = np.maximum(by_shift[1], 1e-9)
-    noise = variance * own_power.reshape(-1, members).sum(axis=1) / (
-        shift_power * np.square(smooth))
-    return ProfileFit(
-        said / (own_power * smooth.repeat(members)),
-        np.sqrt(noise.repeat(members) / own_power), found.repeat(members)), moved / smooth
+    noise = variance * pooled[1, 1] / (shift_power * np.square(smooth))
+    return _Seen(
+        ProfileFit(said / (own_power * smooth.repeat(members)),
+                   np.sqrt(noise.repeat(members) / own_power), found.repeat(members)),
+        moved / smooth, seen[7], seen[3])
 
 
 def median(values: Array) -> float:
