@@ -21,6 +21,8 @@ pose; who predicts again at the pose found makes it exact.
 
 from __future__ import annotations
 
+from functools import cache
+
 from nccs_pose.estimation.common_errors import common_variance
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
@@ -81,7 +83,7 @@ def solve_shifts(
     """
     free, known, told = _prior(start, prior, attitude_sigma)
     rows = np.empty((len(free) + 1, len(shift)))
-    np.divide(slide.T[free], sigma, out=rows[:-1])
+    np.divide(slide.T.take(free, axis=0), sigma, out=rows[:-1])
     np.divide(shift, sigma, out=rows[-1])
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
@@ -90,7 +92,7 @@ def solve_shifts(
     inlier = trusted.repeat(members)
     at, = inlier.nonzero()
     inliers = rows.take(at, axis=1)
-    squares = inliers @ inliers.T
+    squares = inliers.dot(inliers.T)
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
     e = _residual(inliers, unknowns)
@@ -103,12 +105,12 @@ def solve_shifts(
         moved = image_shift[inlier] / sigma[inlier, None]
         answer = covariance @ (inliers[:-1] @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
-    (x, y, yaw, *others), attitude = unknowns.tolist(), np.zeros(3)
-    for unknown, value in zip(free[3:], others):
-        attitude[unknown - 3] = value
+    step = np.zeros(6)
+    step[free] = unknowns
+    x, y, yaw = step[:3].tolist()
     return Refinement(
         Pose2(start.x + x, start.y + y, start.yaw + yaw),
-        0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], attitude,
+        0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], step[3:],
         _residual(rows, unknowns), inlier, True)
 
 
@@ -128,13 +130,13 @@ def _robust(
         square = e * e
         width = _CAUCHY**2 * _robust_variance(square)
         weight = width / (width + square)
-        weighed = (equations * weight) @ equations.T
+        weighed = (equations * weight).dot(equations.T)
         normal = weighed[:-1, :-1] + known
         before = unknowns
         unknowns = definite_solution(normal, weighed[:-1, -1] + told)
         e = _residual(equations, unknowns)
         step = unknowns - before
-        if step @ normal @ step < _FOUND:
+        if step.dot(normal).dot(step) < _FOUND:
             break
     square = e * e
     return unknowns, square <= _GATE**2 * _robust_variance(square)
@@ -142,27 +144,32 @@ def _robust(
 
 def _prior(
     start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
-) -> tuple[list[int], Array, Array]:
+) -> tuple[NDArray[np.intp], Array, Array]:
     """Free unknowns, the information about them (K, K), and that times their expected step (K,).
 
     The step is from the start; what is merely vague expects none.
     """
-    height, tilt = attitude_sigma
-    free = [0, 1, 2] + ([3] if height > 0.0 else []) + ([4, 5] if tilt > 0.0 else [])
-    information, told = np.zeros((len(free), len(free))), np.zeros(len(free))
-    information[:3, :3] = _VAGUE
+    free, vague = _unknowns(*attitude_sigma)
+    information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
         known = inverse(prior[1])
         information[:3, :3] += known
-        told[:3] = known @ prior[0].minus(start)
-    for place, unknown in enumerate(free[3:], start=3):
-        information[place, place] = (height if unknown == 3 else tilt) ** -2.0
+        told[:3] = known.dot(prior[0].minus(start))
     return free, information, told
+
+
+@cache
+def _unknowns(height: float, tilt: float) -> tuple[NDArray[np.intp], Array]:
+    """Free unknowns (K,) with these deviations, and the information about them (K, K)."""
+    sigmas = np.array([height, tilt, tilt])
+    free = np.array([0, 1, 2, *(3 + np.flatnonzero(sigmas > 0.0))], dtype=np.intp)
+    information = np.diag([*np.diag(_VAGUE), *sigmas[sigmas > 0.0]**-2.0])
+    return free, information
 
 
 def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
     """Of equations (K + 1, N) at the unknowns (K,)."""
-    return rows[-1] - unknowns @ rows[:-1]
+    return rows[-1] - unknowns.dot(rows[:-1])
 
 
 def _robust_variance(square: Array) -> float:
