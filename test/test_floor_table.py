@@ -90,15 +90,17 @@ def test_derivatives_of_pixels_are_those_of_the_exact_projection(
 
 
 def test_it_is_known_about_where_points_are_seen(rig: Rig, table: FloorTable) -> None:
-    found = table.expand(as_complex(_floor_points(rig, 1.2 * REACH)))
-    pixels = as_points(found.pixels)
+    points = as_complex(_floor_points(rig, 1.2 * REACH))
+    found, seen = table.outline(points)
+    pixels = as_points(found)
     near = [table.sees_floor(pixels + 5.0 * np.array(way)) for way in (
         (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))]
     inside, outside = np.all(near, axis=0), ~np.any(near, axis=0)
     assert inside.sum() > 200
     assert outside.sum() > 200
-    assert found.seen[inside].all()
-    assert not found.seen[outside].any()
+    assert seen[inside].all()
+    assert not seen[outside].any()
+    assert np.abs(found - table.expand(points).pixels)[seen].max() < 0.3
 
 
 def test_the_region_is_where_pixels_see_the_floor(rig: Rig, table: FloorTable) -> None:

@@ -88,10 +88,11 @@ class BandPredictor:
         self._direction = as_complex(line_map.directions[self._lines, :2])
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        # Half width, length, parts (see _GAPS) per metre and direction to the left, by rows.
+        # Half width, length, parts (see _GAPS) per metre, the first of them and direction to the
+        # left, by rows.
         self._tapes = np.array([
             self._half_width, self._length, _GAPS / self._length,
-            -self._direction.imag, self._direction.real])
+            _GAPS * np.arange(len(self._lines)), -self._direction.imag, self._direction.real])
         distance = np.linspace(0.0, 1.0, _COARSE) * self._length[:, None]
         self._samples = (self._start[:, None] + distance * self._direction[:, None]).ravel()
         self._distance = distance.ravel()
@@ -109,9 +110,9 @@ class BandPredictor:
         :param lines: of the map that get any; None for all.
         """
         tapes = len(self._lines)
-        image = self._table.expand(
+        pixels, seen = self._table.outline(
             (self._samples - complex(pose.x, pose.y)) * _turned_back(pose))
-        curve, seen = image.pixels.reshape(-1, _COARSE), image.seen.reshape(-1, _COARSE)
+        curve, seen = pixels.reshape(-1, _COARSE), seen.reshape(-1, _COARSE)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
         # invertible.
@@ -121,11 +122,11 @@ class BandPredictor:
         axis = steps.cumsum()
         begin = axis[::_COARSE]
         length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
-        count = np.minimum(min(most, _MOST // max(tapes, 1)), length // spacing).astype(int)
+        count = np.minimum(min(most, _MOST // max(tapes, 1)), length / spacing).astype(int)
         if lines is not None:
             count[~np.isin(self._lines, list(lines))] = 0
         # All groups are equal, so that what is summed over them needs no list of their sizes.
-        shown = max(float(length @ (count > 0)), spacing)
+        shown = max(float(length.dot(count > 0)), spacing)
         members = max(round(_SHARED_PX * int(count.sum()) / shown), 1)
         count -= count % members
         number = np.arange(tapes).repeat(count)
@@ -151,32 +152,32 @@ class BandPredictor:
         number, distance = places.number, places.distance
         turn = _turned_back(pose)
         origin = (self._start - complex(pose.x, pose.y)) * turn
-        ahead = self._direction * turn
-        ahead_of = ahead.take(number)
-        middle = origin.take(number) + distance * ahead_of
+        turns = ((self._direction * turn) ** _TURNS[:, None]).take(number, axis=1)
+        ahead = turns[1]
+        middle = origin.take(number) + distance * ahead
         if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
         image = self._table.expand(middle)
         # How the pixel goes as the point goes ahead on the line, and to its left.
-        pixels, by_ahead, by_left, twice_ahead, twice_mixed, twice_left = _TO_LINE @ (
-            image.terms * (ahead ** _TURNS[:, None]).take(number, axis=1))
+        along = _TO_LINE.dot(image.terms * turns)
+        pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left = along
         speed = np.abs(by_ahead)
-        turned = by_left / by_ahead
+        turned, bent = along[2:4] / by_ahead
         tapes = self._tapes.take(number, axis=1)
-        (half, length, gaps_per_metre), left = tapes[:3], tapes[3:]
+        (half, length, gaps_per_metre, first_gap), left = tapes[:4], tapes[4:]
         # The cut across the tape whose image is normal to the curve leans along the line.
         lean = -turned.real
         gain = np.abs(turned.imag) * speed
         # One over the speed, negative where the image is reflected.
         slowness = np.copysign(1.0, turned.imag) / speed
         across = 1j * slowness * by_ahead
-        bend = slowness * (twice_ahead / by_ahead).imag
+        bend = slowness * bent.imag
         # The two edges lie unequally far from the midline: a matter of the second order.
         centre = as_points(pixels + 0.5 * half * half * (
             (twice_ahead * lean + twice_mixed) * lean + twice_left))
         half_width = half * gain
         gap = self._gap.take(
-            number * _GAPS + (distance * gaps_per_metre).astype(np.intp), mode='clip')
+            (distance * gaps_per_metre + first_gap).astype(np.intp), mode='clip')
         # Near its ends the leaning cut would leave the tape.
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
                 & (np.minimum(distance, length - distance) > half * np.abs(lean)))
@@ -185,7 +186,7 @@ class BandPredictor:
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
         # along its line does not count.
         slide = np.empty((6, len(number)))
-        against, back = -gain, ahead_of.conj()
+        against, back = -gain, ahead.conj()
         np.multiply(against, left, out=slide[:2])
         np.multiply(against, (back * middle).real, out=slide[2])
         # Floor that sinks by dz is seen where the ray would have met it, further out.

@@ -68,12 +68,10 @@ class FloorExpansion:
 
     :ivar terms: p, P, Q, U, V and W by rows (6, N); px, px per metre, px per square metre.
     :ivar falls: how far over the floor their rays go as they fall by a metre (N,).
-    :ivar seen: whether the image shows the floor about there (N,), to a few px.
     """
 
     terms: Complex
     falls: Complex
-    seen: NDArray[np.bool_]
 
     @property
     def pixels(self) -> Complex:
@@ -102,13 +100,13 @@ class FloorTable:
                 f'the mirror at height {self.height} m does not stand over a floor')
         self._foot = complex(*self.foot)
         self._grid, self._grid_reaches = self._backward()
-        self.region = self._region()
+        cells = self._cells()
+        self.region = self._region(cells)
         # All that lies outside comes to lie on the frame round it.
-        self._sees_floor = np.pad(self.region > 0, 1)
-        self._beyond = np.array([rig.camera.width, rig.camera.height], dtype=float)
-        # From one pixel to the next, right and down, and where the first one is.
-        self._apart = np.array([1.0, rig.camera.width + 2.0])
-        self._first = rig.camera.width + 3.0
+        self._sees_floor = np.pad(cells, 1)
+        self._beyond = np.array(cells.shape[::-1]) + 1.0
+        # From one cell to the next, right and down.
+        self._apart = np.array([1, cells.shape[1] + 2])
         self._knots = self._forward()
 
     def _forward(self) -> Complex:
@@ -185,10 +183,10 @@ class FloorTable:
         """
         at = as_complex(points)
         knots, step = self._nearest(at)
-        steeper = knots[:, 8].real
+        steeper = knots[8].real
         # The ray meets the floor a little further on, but comes from the same place.
         share = rise / np.maximum(1.0 - rise * steeper, 0.5)
-        return as_points(at + share * (knots[:, 7] + steeper * step))
+        return as_points(at + share * (knots[7] + steeper * step))
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
@@ -200,27 +198,39 @@ class FloorTable:
         From the nearest knot on, to second order.
         """
         knots, step = self._nearest(points)
-        terms = np.ascontiguousarray(knots[:, :6].T)
-        back = step.conj()
+        terms, back = knots[:6], step.conj()
         # Half of what the step adds to the first derivatives; the pixel goes by their mean.
         slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
         slopes += added
         terms[0] += slopes[0] * step + slopes[1] * back
         slopes += added
-        return FloorExpansion(
-            terms, knots[:, 7] + knots[:, 8].real * step, knots[:, 8].imag > 0.0)
+        return FloorExpansion(terms, knots[7] + knots[8].real * step)
+
+    def outline(self, points: Complex) -> tuple[Complex, NDArray[np.bool_]]:
+        """About where ground points x + iy (N,) in base_link are seen, and whether they are.
+
+        :returns: pixels u + iv (N,) to first order, good to some tenths of one; and whether the
+            image shows the floor about there (N,), to a few px.
+        """
+        knots, step = self._nearest(points)
+        pixels = knots[0] + knots[1] * step + knots[2] * step.conj()
+        return pixels, np.asarray(knots[8].imag > 0.0)
 
     def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
-        """The nearest knots to points (N, 9), see :meth:`_forward`, and the way from them (N,)."""
+        """The nearest knots to points (9, N), see :meth:`_forward`, and the way from them (N,)."""
         offset = points - self._foot
-        place = np.rint(_CELLS * self._place(offset)).view(np.float64).reshape(-1, 2)
-        at = place @ _KNOTS_APART + _MIDDLE_KNOT
-        knots = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
-        return knots, offset - knots[:, 6]
+        place = as_points(np.rint(self._place(offset, _CELLS)))
+        at = place.dot(_KNOTS_APART) + _MIDDLE_KNOT
+        some = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
+        knots = np.ascontiguousarray(some.T)
+        return knots, offset - knots[6]
 
-    def _place(self, offset: Complex) -> Complex:
-        """Where the stereographic plane has points of the floor: infinity is the unit circle."""
-        return offset / (self.height + np.hypot(np.abs(offset), self.height))
+    def _place(self, offset: Complex, infinity: float = 1.0) -> Complex:
+        """Where the stereographic plane has points of the floor.
+
+        :param infinity: the radius of its circle.
+        """
+        return offset * (infinity / (self.height + np.hypot(np.abs(offset), self.height)))
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
@@ -236,18 +246,25 @@ class FloorTable:
         shape = (len(rows), len(columns))
         return points.reshape(*shape, 2), reaches.reshape(shape)
 
-    def _region(self) -> NDArray[np.uint8]:
-        camera = self.rig.camera
-        cell = (self._grid_reaches[:-1, :-1] & self._grid_reaches[1:, :-1]
-                & self._grid_reaches[:-1, 1:] & self._grid_reaches[1:, 1:])
-        full = np.kron(cell.astype(np.uint8), np.full((_STRIDE, _STRIDE), 255, np.uint8))
-        return np.ascontiguousarray(full[:camera.height, :camera.width])
+    def _cells(self) -> NDArray[np.bool_]:
+        """Which cells of the coarse grid, of those wholly in the image, see the floor."""
+        camera, reaches = self.rig.camera, self._grid_reaches
+        cells = reaches[:-1, :-1] & reaches[1:, :-1] & reaches[:-1, 1:] & reaches[1:, 1:]
+        return np.asarray(cells[:camera.height // _STRIDE, :camera.width // _STRIDE])
+
+    def _region(self, cells: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        region = np.zeros((self.rig.camera.height, self.rig.camera.width), np.uint8)
+        seen = np.kron(cells.astype(np.uint8), np.full((_STRIDE, _STRIDE), 255, np.uint8))
+        region[:seen.shape[0], :seen.shape[1]] = seen
+        return region
 
     def sees_floor(self, pixels: Array) -> NDArray[np.bool_]:
         """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
-        at = np.rint(np.minimum(np.maximum(pixels, -1.0), self._beyond)) @ self._apart
-        # What is not a number becomes an index below all others, and is taken for the first.
-        return self._sees_floor.take((at + self._first).astype(np.intp), mode='clip')
+        # Of the nearest pixel, in cells after the frame's corner.
+        at = pixels * (1.0 / _STRIDE) + (1.0 + 0.5 / _STRIDE)
+        cell = np.minimum(np.maximum(at, 0.0), self._beyond).astype(np.intp)
+        # What is not a number becomes an index far from all others, and is taken for a corner.
+        return self._sees_floor.take(cell.dot(self._apart), mode='clip')
 
     def floor(self, pixels: Array) -> tuple[Array, Array]:
         """Ground points (N, 2) of pixels in :attr:`region`, and d(point)/d(u, v) (N, 2, 2).
