@@ -89,9 +89,9 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
-    :ivar width: mean width of each line's stations in the image (L,), px; NaN likewise.
     :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
     :ivar colours: the colours as this image shows them.
+    :ivar bands: all stations that were looked at.
     """
 
     pose: Pose2
@@ -104,9 +104,17 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
-    width: Array
     misfit: float
     colours: tuple[LineColour, ...]
+    bands: Bands
+
+    @cached_property
+    def width(self) -> Array:
+        """Mean width of each map line's stations in the image (L,), px; NaN out of view."""
+        label, lines = self.bands.label, len(self.support)
+        seen = np.bincount(label, minlength=lines)
+        return 2.0 * np.bincount(label, self.bands.half_width, lines) / np.where(
+            seen > 0, seen, np.nan)
 
     @cached_property
     def scale(self) -> float:
@@ -129,7 +137,7 @@ class _Measured:
     """One pass: what the stations say, which of them are used, and the pose that follows.
 
     :ivar moved: how far the solve moves the station that it moves farthest, px.
-    :ivar leant: the same by height, roll and pitch alone.
+    :ivar leant: how far height, roll and pitch alone move each (N,), px.
     """
 
     refinement: Refinement
@@ -137,7 +145,7 @@ class _Measured:
     fit: ProfileFit
     used: NDArray[np.intp]
     moved: float
-    leant: float
+    leant: Array
     colours: tuple[LineColour, ...]
 
 
@@ -232,7 +240,7 @@ class Aligner:
         if rough is None:
             return None if reach > 0.0 else (start, level)
         # What profiles bear needs no bands of its own.
-        leans = rough.leant > _SETTLED_BLURS * sharpest
+        leans = np.abs(rough.leant).max() > _SETTLED_BLURS * sharpest
         return rough.refinement.pose, rough.refinement.attitude if leans else level
 
     def _fit(
@@ -274,7 +282,8 @@ class Aligner:
 
     def _solved(
         self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp],
-        label: NDArray[np.intp], across: Array, start: Pose2, prior: tuple[Pose2, Array] | None,
+        label: NDArray[np.intp], across: Array | None, start: Pose2,
+        prior: tuple[Pose2, Array] | None,
     ) -> Refinement:
         options = self._options
         return solve_shifts(
@@ -301,15 +310,16 @@ class Aligner:
             return None
         if not rough and float(bands.spacing.take(used).sum()) < _LEAST_LENGTH:
             return None
+        by_pose, by_attitude = slide.T[:3], slide.T[3:]
         refinement = self._solved(
-            (fit.shift + slide[:, 3:] @ attitude).take(used), fit.sigma.take(used),
+            (fit.shift + attitude.dot(by_attitude)).take(used), fit.sigma.take(used),
             slide.T.take(used, axis=1).T, used // bands.members, bands.label.take(used),
-            bands.across.take(used, axis=0), start, prior)
-        leant = slide[:, 3:] @ (refinement.attitude - attitude)
-        moved = slide[:, :3] @ refinement.pose.minus(start) + leant
+            bands.across.take(used, axis=0) if self._options.calibration_sigma > 0.0 else None,
+            start, prior)
+        leant = (refinement.attitude - attitude).dot(by_attitude)
+        moved = refinement.pose.minus(start).dot(by_pose) + leant
         return _Measured(
-            refinement, bands, fit, used, float(np.abs(moved).max()), float(np.abs(leant).max()),
-            colours)
+            refinement, bands, fit, used, float(np.abs(moved).max()), leant, colours)
 
 
 def _alignment(measured: _Measured, lines: int) -> Alignment:
@@ -323,23 +333,22 @@ def _alignment(measured: _Measured, lines: int) -> Alignment:
     sigma, label = fit.sigma.take(index), bands.label.take(index)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, members = runs(index // bands.members)
-    together = 1.0 / np.sqrt(np.add.reduceat(1.0 / np.square(sigma), first))
+    # Residuals of whole groups, times what noise the group has together.
     misfit = common_misfit(
-        np.add.reduceat(residual, first) / np.sqrt(members), together, label.take(first))
+        np.add.reduceat(residual, first) / np.sqrt(
+            members * np.add.reduceat(1.0 / np.square(sigma), first)), label.take(first))
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
-    in_view = np.where(seen > 0, seen, np.nan)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
         float(worth.take(index).sum() / worth.sum()),
         tuple(there.nonzero()[0].tolist()), _missing(bands, index),
-        there / in_view, 2.0 * np.bincount(bands.label, bands.half_width, lines) / in_view, misfit,
-        measured.colours)
+        there / np.where(seen > 0, seen, np.nan), misfit, measured.colours, bands)
 
 
 def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
     """Lines that should be seen plainly, of which next to nothing is among the found stations."""
-    plain = bands.spacing * (2.0 * bands.half_width >= _PLAIN_WIDTH)
+    plain = bands.spacing * (bands.half_width >= 0.5 * _PLAIN_WIDTH)
     seen = np.bincount(bands.label, plain)
     there = np.bincount(bands.label.take(found), plain.take(found), minlength=len(seen))
     return tuple(((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).nonzero()[0].tolist())
@@ -348,4 +357,4 @@ def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:
     """Whether two poses agree within so many standard deviations of a covariance (3, 3)."""
     difference = a.minus(b)
-    return float(difference @ solution(covariance, difference)) <= sigmas**2
+    return float(difference.dot(solution(covariance, difference))) <= sigmas**2

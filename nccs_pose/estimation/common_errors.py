@@ -61,14 +61,14 @@ def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -
         independent errors of their size would come to.
     """
     fitted = max(float(leverage.sum()), 1e-12)
-    taken = float(leverage @ leverage) / fitted
+    taken = float(leverage.dot(leverage)) / fitted
     weighed = residual * np.sqrt(leverage)
     variance = max(_square(weighed) / (fitted * max(1.0 - taken, 1e-12)), 1e-12)
     shown = 0.0
     for lag in range(1, _LAGS + 1):
         along = label[lag:] == label[:-lag]
-        products = float((weighed[lag:] * weighed[:-lag]) @ along)
-        shown += products / max(float(leverage[lag:] @ along), 1e-12) / variance
+        products = float((weighed[lag:] * weighed[:-lag]).dot(along))
+        shown += products / max(float(leverage[lag:].dot(along)), 1e-12) / variance
     taken *= _LAGS * (1.0 + _UNCERTAIN / fitted)
     correlation = shown
     for _ in range(2):
@@ -76,17 +76,16 @@ def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -
     return variance * math.exp(2.0 * max(correlation, -_LIMIT))
 
 
-def common_misfit(residual: Array, sigma: Array, label: NDArray[np.intp]) -> float:
+def common_misfit(offset: Array, label: NDArray[np.intp]) -> float:
     """Root mean square by which stretches of lines lie off beyond what their noise explains, px.
 
-    :param residual: residuals whitened by the pixels' noise (N,), along each line in order.
-    :param sigma: their scale (N,), px.
+    :param offset: of stations or groups (N,), px, along each line in order.
     :param label: line (N,), ascending.
     """
-    in_px = (residual * sigma)[in_whole_parts(label, _BLOCK)].reshape(-1, _BLOCK)
+    blocks = offset[in_whole_parts(label, _BLOCK)].reshape(-1, _BLOCK)
     # Beyond what independent errors of this size give the blocks' means.
-    beyond_noise = _square(in_px.sum(axis=1)) - _square(in_px)
-    return math.sqrt(max(0.0, beyond_noise) / max(1, len(in_px))) / _BLOCK
+    beyond_noise = _square(blocks.sum(axis=1)) - _square(blocks)
+    return math.sqrt(max(0.0, beyond_noise) / max(1, len(blocks))) / _BLOCK
 
 
 def root_mean_square(values: Array) -> float:

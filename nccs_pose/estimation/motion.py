@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
@@ -71,7 +72,7 @@ class Prediction:
     carried: Array
     by_odometry: bool
 
-    @property
+    @cached_property
     def covariance(self) -> Array:
         """What the image is held against (3, 3): never so narrow that it would rule the image."""
         return self.carried + FLOOR
@@ -86,9 +87,9 @@ class Prediction:
         :param solved: of the solve, which had :attr:`covariance` as its prior.
         """
         prior = self.covariance
-        gain = solved @ inverse(prior)
+        gain = solved.dot(inverse(prior))
         multiple = max(1.0, float(covariance.trace() / solved.trace()))
-        narrowed = covariance - gain @ (multiple * prior - self.carried) @ gain.T
+        narrowed = covariance - gain.dot(multiple * prior - self.carried).dot(gain.T)
         return covariance if inverse_3x3(narrowed) is None else narrowed
 
 
@@ -135,11 +136,12 @@ class Odometry:
 def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two stamps."""
     step = before.inverse() @ after
+    moved = pose @ step
     distance, angle = math.hypot(step.x, step.y), abs(step.yaw)
     sigma = _PER_METRE[0] * math.sqrt(distance)
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle))
-    return Prediction(pose @ step, _carried(pose, covariance, step, sigma, sigma_yaw), True)
+    return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
 
 
 def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction | None:
@@ -154,23 +156,23 @@ def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction 
     if before is None:
         sigma, sigma_yaw = (speed * blind for speed in _SPEED)
         return Prediction(last.pose, _carried(
-            last.pose, last.covariance, Pose2(0.0, 0.0, 0.0), sigma, sigma_yaw), False)
+            last.pose, last.covariance, last.pose, sigma, sigma_yaw), False)
     past = (last.stamp_ns - before.stamp_ns) * 1e-9
     if not 0.0 < past <= _LONGEST_COAST:
         return None
     twist = before.pose.inverse() @ last.pose
     share = dt / past
     step = Pose2(share * twist.x, share * twist.y, share * float(wrap_angle(twist.yaw)))
+    moved = last.pose @ step
     sigma, sigma_yaw = (0.5 * a * blind * (blind + past) for a in _ACCELERATION)
     return Prediction(
-        last.pose @ step, _carried(last.pose, last.covariance, step, sigma, sigma_yaw), False)
+        moved, _carried(last.pose, last.covariance, moved, sigma, sigma_yaw), False)
 
 
 def _carried(
-    pose: Pose2, covariance: Array, step: Pose2, sigma: float, sigma_yaw: float,
+    pose: Pose2, covariance: Array, moved: Pose2, sigma: float, sigma_yaw: float,
 ) -> Array:
-    """Covariance (3, 3) after a step: an error in yaw swings the step sideways."""
-    moved = pose @ step
+    """Covariance (3, 3) of a pose moved on: an error in yaw swings the step sideways."""
     # How the place goes as the yaw does.
     a, b = pose.y - moved.y, moved.x - pose.x
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()

@@ -35,7 +35,7 @@ import math
 from nccs_pose.estimation.general_lines import ALIGNED
 from nccs_pose.estimation.pose_monomials import feet_in_plan
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.small_matrices import inverse_2x2, solved
+from nccs_pose.geometry.small_matrices import inverse_2x2, solve_3x3
 import numpy as np
 
 # Two lines of a map written by hand are parallel, or meet, when they do so up to this (rad, m).
@@ -137,7 +137,9 @@ def unobserved_directions(
     :param limit: a direction is unobserved when its standard deviation, in metres and radians
         alike, is larger than this.
     """
-    if solved(information - np.eye(3) / (limit * limit), np.zeros(3)) is not None:
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = information.tolist()
+    least = 1.0 / (limit * limit)
+    if solve_3x3(xx - least, xy, yy - least, xz, yz, zz - least, 0.0, 0.0, 0.0) is not None:
         # What remains is positive definite: all eigenvalues are larger than that.
         return ()
     values, vectors = np.linalg.eigh(information)

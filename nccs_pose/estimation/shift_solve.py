@@ -97,7 +97,8 @@ def solve_shifts(
     # The prior's share is weighed against residuals of the size that they have.
     e = _residual(inliers, unknowns)
     one = _ONE[:len(free), :len(free)]
-    leverage = (definite_solution(normal + known, one) @ inliers[:-1] * inliers[:-1]).sum(axis=0)
+    leverage = (
+        definite_solution(normal + known, one).dot(inliers[:-1]) * inliers[:-1]).sum(axis=0)
     inflation = max(common_variance(e, leverage, label.take(at)) / _WITHIN_GATE, 1e-6)
     covariance = definite_solution(normal / inflation + known, one)
     unknowns = covariance @ (right / inflation + told)

@@ -116,12 +116,11 @@ def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     The deviation comes from the line's own scatter: a line that lies off as a whole must not
     pass for noise.
     """
-    label = alignment.points.label
-    offset = alignment.residual * alignment.noise
-    weight = 1.0 / np.square(alignment.noise)
-    total = np.maximum(np.bincount(label, weight, minlength=lines), 1e-12)
-    mean = np.bincount(label, weight * offset, minlength=lines) / total
-    scatter = np.bincount(label, weight * np.square(offset - mean[label]), minlength=lines)
+    label, residual, noise = alignment.points.label, alignment.residual, alignment.noise
+    # Offsets are the residuals times the noise, and weigh by one over its square.
+    total = np.maximum(np.bincount(label, 1.0 / np.square(noise), lines), 1e-12)
+    mean = np.bincount(label, residual / noise, lines) / total
+    scatter = np.bincount(label, np.square(residual), lines) - total * np.square(mean)
     count = np.maximum(np.bincount(label, minlength=lines) - 1, 1)
     return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)
 

@@ -71,5 +71,5 @@ def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def in_whole_parts(number: NDArray[np.intp], size: int) -> NDArray[np.bool_]:
     """Which of N > 0 are in parts of so many equal numbers (N,), from the start of each run on."""
     first, count = runs(number)
-    place = np.arange(len(number)) - first.repeat(count)
-    return np.asarray(place < (count - count % size).repeat(count))
+    end = first + count - count % size
+    return np.asarray(np.arange(len(number)) < end.repeat(count))
