@@ -1,0 +1,123 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is left of the poses that were laid on an image."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.judge import Found
+from nccs_pose.estimation.ledger import Ledger
+from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.verdict import Objection
+from nccs_pose.geometry.pose import Pose2
+import numpy as np
+
+RATIO = 0.85
+AWAY = Objection('it is not there')
+HALF_TURN = Pose2(0.0, 0.0, np.pi)
+HERE, THERE, NOWHERE = Pose2(1.0, 0.0, 0.0), Pose2(4.0, 2.0, 1.0), Pose2(-3.0, 2.0, 2.0)
+
+
+def _alignment(pose: Pose2) -> Any:
+    return SimpleNamespace(pose=pose)
+
+
+def _found(pose: Pose2, score: float, by_strips: float = 0.8) -> Found:
+    return Found(_alignment(pose), 1.0, score, by_strips)
+
+
+def _strips(pose: Pose2, score: float) -> FittedCandidate:
+    return FittedCandidate(pose, score, 1.0)
+
+
+def _told(pose: Pose2) -> Told:
+    return Told(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
+
+
+def test_a_pose_is_known_with_its_twins() -> None:
+    ledger = Ledger((HALF_TURN,), None, RATIO, ())
+    assert not ledger.knows(HERE)
+    ledger.refuse(AWAY, _alignment(HERE))
+    assert ledger.knows(HERE) and ledger.was_laid(HERE)
+    assert ledger.knows(HALF_TURN @ HERE) and not ledger.was_laid(HALF_TURN @ HERE)
+    ledger.miss(THERE)
+    assert ledger.knows(HALF_TURN @ THERE) and not ledger.knows(THERE)
+    assert not ledger.knows(NOWHERE)
+
+
+def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
+    twin = HALF_TURN @ HERE
+    assert Ledger((HALF_TURN,), None, RATIO, ()).hold(_found(HERE, 0.9), 0.0) == []
+    ledger = Ledger((HALF_TURN,), _told(twin), RATIO, ())
+    assert ledger.hold(_found(HERE, 0.9), 0.0) == [twin]
+    assert not ledger.knows(twin)
+    assert ledger.closed().open == []
+
+
+def test_what_holds_leaves_its_twins_open() -> None:
+    for told in (None, _told(HERE)):
+        ledger = Ledger((HALF_TURN,), told, RATIO, ())
+        ledger.hold(_found(HERE, 0.9), 0.0)
+        twin, = ledger.closed().open
+        assert twin.pose == HALF_TURN @ HERE
+        assert twin.score == 0.9
+
+
+def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() -> None:
+    left = [_strips(THERE, 0.7), _strips(NOWHERE, 0.6), _strips(HERE, 0.8)]
+    ledger = Ledger((), None, RATIO, left)
+    assert ledger.closed().open == []
+    ledger.hold(_found(HERE, 0.9, by_strips=0.8), 0.0)
+    ledger.leave(_strips(HALF_TURN @ HERE, 0.95))
+    opened = ledger.closed().open
+    assert [c.pose for c in opened] == [HALF_TURN @ HERE, THERE]
+    assert opened[0].score == 0.9
+    assert opened[1].score == 0.7 / 0.8 * 0.9
+
+
+def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
+    for best, opens in ((0.5, True), (0.9, False)):
+        ledger = Ledger((), None, RATIO, ())
+        ledger.doubt(AWAY, _found(THERE, 0.6))
+        ledger.hold(_found(HERE, best), 0.0)
+        sifted = ledger.closed()
+        assert [c.pose for c in sifted.open] == ([THERE] if opens else [])
+        assert [c.pose for c in sifted.hidden] == ([] if opens else [THERE])
+
+
+def test_the_best_is_first_and_tied_by_its_equals() -> None:
+    ledger = Ledger((), None, RATIO, ())
+    assert not ledger.is_tied()
+    ledger.hold(_found(HERE, 0.7), 0.4)
+    ledger.hold(_found(THERE, 0.9), 0.2)
+    assert ledger.best is not None and ledger.best.alignment.pose == THERE
+    assert ledger.best_misfit == 0.2
+    assert not ledger.is_tied()
+    ledger.hold(_found(NOWHERE, 0.8), 0.0)
+    assert ledger.is_tied()
+    assert [f.score for f in ledger.closed().held] == [0.9, 0.8, 0.7]
+
+
+def test_what_something_hides_is_hidden_with_its_twins() -> None:
+    ledger = Ledger((HALF_TURN,), None, RATIO, ())
+    ledger.hide(AWAY, _found(HERE, 0.5, by_strips=0.6))
+    ledger.rule_out(_strips(THERE, 0.4), AWAY)
+    sifted = ledger.closed()
+    assert [(c.pose, c.score) for c in sifted.hidden] == [
+        (HERE, 0.6), (HALF_TURN @ HERE, 0.6), (THERE, 0.4)]
+    assert len(sifted.refused) == 2 and sifted.held == []
