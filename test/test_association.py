@@ -258,6 +258,34 @@ def test_one_strip_across_many_heavier_ones_is_enough(table: FloorTable) -> None
     assert _near(Associator(line_map, table).candidates(strips)[0].pose, pose)
 
 
+def test_a_short_coarse_strip_may_point_elsewhere(table: FloorTable) -> None:
+    corners = [(-1.6, -1.2), (1.4, -1.5), (1.6, 1.1), (-1.5, 0.9)]
+    line_map = LineMap(tuple(_line(a, b) for a, b in zip(corners, corners[1:] + corners[:1])))
+    pose = Pose2(0.3, 0.1, -2.8)
+    long, other, *_ = _strips(line_map, pose, np.random.default_rng(28), 0.002)
+
+    def turned(angle: float, footprint: float) -> FloorSegment:
+        """A metre of the second strip, seen askew by its pixels."""
+        along = (other.end - other.start) / np.linalg.norm(other.end - other.start)
+        middle, turn = 0.5 * (other.start + other.end), np.exp(1j * angle)
+        c, s = turn.real, turn.imag
+        along = np.array([c * along[0] - s * along[1], s * along[0] + c * along[1]])
+        normal = np.array([-along[1], along[0]])
+        return replace(
+            other, normal=normal, offset=float(normal @ middle), start=middle - 0.5 * along,
+            end=middle + 0.5 * along, footprint=footprint)
+
+    def is_found(strip: FloorSegment) -> bool:
+        candidates = Associator(line_map, table).candidates((long, strip))
+        return any(_near(c.pose, pose, 0.2, 0.1) for c in candidates)
+
+    assert abs(float(long.normal @ other.normal)) < 0.3
+    for angle in (-0.17, 0.17):
+        assert is_found(turned(angle, 0.065))
+        # Of fine pixels it is another line.
+        assert not is_found(turned(angle, 0.01))
+
+
 def test_the_misfit_is_the_distance_of_the_strips_in_pixels(table: FloorTable) -> None:
     line_map = LineMap((
         _line((-2.0, 1.0), (1.0, 1.0)), _line((1.5, -2.0), (1.5, 0.5)),

@@ -29,9 +29,14 @@ from numpy.typing import NDArray
 _ENOUGH = 1500
 # A strip with each of those that are heavier, and then the next; no image has more of them.
 _BY_WEIGHT = np.tril_indices(128, -1)
-# Two lines must differ by this angle to cross usefully, and agree to it to be matched, rad.
+# Two lines must differ by this angle to cross usefully, rad.
 _CROSSING = 0.12
+# To be matched they must agree with strips to the first of these angles or, where those are short
+# and the image is coarse, to so many times what is unsure of their directions, if not by more than
+# the last, rad.
 _ANGLE_GATE = 0.07
+_UNSURE = 3.0
+_WIDEST_GATE = 0.25
 # Strips may reach this much beyond a map line's ends, metres.
 BEYOND = 0.2
 # Of a strip that starts a hypothesis this part may have nothing to do with its line.
@@ -68,6 +73,7 @@ class StripLines:
     :ivar direction: unit (S,), from there to the other end.
     :ivar length: metres (S,).
     :ivar middle: between both ends (S,), metres.
+    :ivar unsure: how unsure the directions are (S,), rad: by a pixel of the image over the length.
     :ivar colour: colour class of each.
     """
 
@@ -75,6 +81,8 @@ class StripLines:
         start, end, left = np.array([(s.start, s.end, s.normal) for s in segments]).reshape(
             -1, 6).view(np.complex128).T
         self.start, self.length, self.direction = start, np.abs(end - start), -1j * left
+        footprint, pitch = np.array([(s.footprint, s.pitch) for s in segments]).T
+        self.unsure = footprint / (pitch * np.maximum(self.length, 1e-9))
         self.middle = 0.5 * (start + end)
         self.colour = tuple(s.colour for s in segments)
 
@@ -101,7 +109,9 @@ def poses_of_pairs(
     between = strips.direction[second] * strips.direction[first].conj()
     cross = np.flatnonzero(np.abs(between.imag) >= math.sin(_CROSSING))[:most]
     first, second, between = first[cross], second[cross], between[cross]
-    match = np.abs((turn * between.conj()[:, None]).imag) < math.sin(_ANGLE_GATE)
+    gate = np.clip(
+        _UNSURE * np.hypot(strips.unsure[first], strips.unsure[second]), _ANGLE_GATE, _WIDEST_GATE)
+    match = np.abs((turn * between.conj()[:, None]).imag) < np.sin(gate)[:, None]
     fits = strips.fits(lines)
     match &= fits[first][:, a] & fits[second][:, b]
     pair, crossing = np.nonzero(match)
