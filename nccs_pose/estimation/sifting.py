@@ -47,6 +47,9 @@ _WORTH_TRYING = 0.75
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
+# A pose that leaves more of the strips unexplained than another by this much is no rival of it: of
+# wrong poses that such an image seemed to show the right one explained as much or more.
+_AS_MUCH = 0.05
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
@@ -256,8 +259,9 @@ class Sifter:
         if case.told is None and self._has_many_equals(found, candidates):
             return found
         least = self._options.ambiguity_ratio * found.by_strips
-        rivals = any(c.score >= least and not same_pose(c.pose, alignment.pose)
-                     for c in candidates)
+        rivals = any(
+            c.score >= least and c.claimed > found.claimed - _AS_MUCH and not same_pose(
+                c.pose, alignment.pose) for c in candidates)
         return _DOUBTFUL if rivals else found
 
     def _is_beaten(self, start: _Start, ledger: Ledger) -> bool:
