@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -121,3 +122,12 @@ def test_what_something_hides_is_hidden_with_its_twins() -> None:
     assert [(c.pose, c.score) for c in sifted.hidden] == [
         (HERE, 0.6), (HALF_TURN @ HERE, 0.6), (THERE, 0.4)]
     assert len(sifted.refused) == 2 and sifted.held == []
+
+
+def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_open() -> None:
+    for best, lines, opens in ((0.5, 3, True), (0.7, 3, False), (0.5, 2, False)):
+        ledger = Ledger((), None, RATIO, ())
+        ledger.hold(_found(HERE, best), 0.0)
+        ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
+            pose=THERE, support=np.ones(lines), explained=1.0)))
+        assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])

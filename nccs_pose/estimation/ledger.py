@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.estimate import Candidate
-from nccs_pose.estimation.judge import Found
+from nccs_pose.estimation.judge import explains_nearly_all, Found
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
@@ -87,6 +87,8 @@ class Ledger:
         self._held: list[Found] = []
         self._refused: list[Refused] = []
         self._hidden: list[Candidate] = []
+        # What would hold, if something hid what they miss.
+        self._excused: list[Found] = []
         # What would hold, if another pose did not show about as much.
         self._doubtful: list[Found] = []
         # Twins of what holds that are not laid on the image themselves.
@@ -153,6 +155,7 @@ class Ledger:
         self.refuse(against, shown.alignment)
         alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
         self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
+        self._excused.append(shown)
 
     def closed(self) -> Sifted:
         """What is left when no more poses are laid on the image."""
@@ -169,7 +172,10 @@ class Ledger:
 
     def _open(self, held: list[Found], best: Found) -> list[Candidate]:
         """The poses that are left open beside those that hold; hides the doubtful that are not."""
-        found: list[Candidate] = []
+        # What explains nearly all, and more than the best does, leaves that in doubt.
+        found = [Candidate(excused.alignment.pose, best.score)
+                 for excused in self._excused
+                 if explains_nearly_all(excused) and excused.score > best.score]
         for doubtful in self._doubtful:
             pose = doubtful.alignment.pose
             if doubtful.score >= self._ratio * best.score:
