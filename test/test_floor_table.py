@@ -184,3 +184,15 @@ def test_a_rig_that_looks_at_the_ceiling_is_refused() -> None:
         T_base_mirror=RigidTransform(np.eye(3), np.array([0.0, 0.0, 0.75])))
     with pytest.raises(GeometryError, match='no floor'):
         FloorTable(up, REACH)
+
+
+def test_a_mirror_that_hides_its_own_foot_shows_the_floor_round_it() -> None:
+    rig = arena_rig()
+    up = replace(rig, T_base_mirror=RigidTransform(np.eye(3), np.array([0.0, 0.0, 0.75])))
+    table, points = FloorTable(up, REACH), _floor_points(up, REACH)
+    exact, visible = up.project(np.column_stack([points, np.zeros(len(points))]))
+    _, seen = table.outline(as_complex(points))
+    assert not visible[np.linalg.norm(points, axis=1) < 0.2].any()
+    known = visible & table.sees_floor(table.pixels(points)) & seen
+    assert known.sum() > 0.9 * (visible & table.sees_floor(exact)).sum() > 200
+    assert np.linalg.norm(table.pixels(points) - exact, axis=1)[known].max() < 2e-2

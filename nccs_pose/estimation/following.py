@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Set
 
-from nccs_pose.estimation.alignment import Aligner
+from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import same_pose

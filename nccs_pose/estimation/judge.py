@@ -19,7 +19,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Set
 from dataclasses import dataclass
 
-from nccs_pose.estimation.alignment import Alignment, close, SPACING
+from nccs_pose.estimation.aligner import SPACING
+from nccs_pose.estimation.alignment import Alignment, close
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.misplaced import placement, plainly_in_place

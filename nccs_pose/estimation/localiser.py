@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from nccs_pose.estimation.admission import Admission
-from nccs_pose.estimation.alignment import Aligner
+from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.decision import left_open, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,

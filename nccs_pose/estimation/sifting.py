@@ -22,7 +22,8 @@ from dataclasses import dataclass
 from itertools import islice
 import math
 
-from nccs_pose.estimation.alignment import Aligner, Alignment, LINEAR_PX
+from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
+from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge

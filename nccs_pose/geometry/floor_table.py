@@ -219,18 +219,15 @@ class FloorTable:
     def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
         """The nearest knots to points (9, N), see :meth:`_forward`, and the way from them (N,)."""
         offset = points - self._foot
-        place = as_points(np.rint(self._place(offset, _CELLS)))
+        place = as_points(np.rint(_CELLS * self._place(offset)))
         at = place.dot(_KNOTS_APART) + _MIDDLE_KNOT
         some = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
         knots = np.ascontiguousarray(some.T)
         return knots, offset - knots[6]
 
-    def _place(self, offset: Complex, infinity: float = 1.0) -> Complex:
-        """Where the stereographic plane has points of the floor.
-
-        :param infinity: the radius of its circle.
-        """
-        return offset * (infinity / (self.height + np.hypot(np.abs(offset), self.height)))
+    def _place(self, offset: Complex) -> Complex:
+        """Where the stereographic plane has points of the floor: infinity is the unit circle."""
+        return offset / (self.height + np.hypot(np.abs(offset), self.height))
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""

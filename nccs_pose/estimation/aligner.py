@@ -1,0 +1,239 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A pose made exact against one image: predict the bands, measure the profiles, refine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from nccs_pose.estimation.alignment import Alignment, alignment_of, close, Pass
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.shift_solve import solve_shifts
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.vision.bands import Bands
+from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.profile_search import search_profiles
+from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR
+import numpy as np
+from numpy.typing import NDArray
+
+# Stations stand no closer in the image than this, px; of a short piece there are fewer.
+SPACING = 2.0
+# Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
+# first, rough pass takes one station of so many; a search takes so many of each line, this far
+# apart (px) or more.
+_ROUGH = 4
+_SEARCHED = 25
+_SEARCHED_SPACING = 8.0
+# A profile is linear in its shift for about so many pixels.
+LINEAR_PX = 2.0
+_ITERATIONS = 8
+# The poses have settled when the last step moved no station by more than this share of the blur
+# (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
+# half a standard deviation), or when it was below half a standard deviation.
+_SETTLED_BLURS = 0.1
+_SETTLED = 0.5
+# Nor does a pass count that has just learned a blur so different, px: a template too soft or too
+# sharp takes a step for larger or smaller than it is.
+_LEARNED_BLUR = 0.1
+# After a step larger than this the stations are chosen anew, px.
+_MOVED_PX = 3.0
+# What still steps at the end, by less than this (m and rad), is uncertain by that much more.
+_LAST_STEP = 0.005
+# A pose rests on so many stations, and on so much of curve, px.
+_LEAST_STATIONS = 12
+_LEAST_LENGTH = 192.0
+# Of a searched pose this part of what must be found at the end has to be found from the first.
+_HOPELESS = 0.8
+# A pass that moves no station further than this, px, shows the lines that the last will.
+_NEARLY = 1.0
+
+
+class Aligner:
+    """Lays poses on images for one rig and map."""
+
+    def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
+        self._predictor = BandPredictor(table, line_map)
+        self._lines = len(line_map)
+        self._options = options
+        names = tuple(dict.fromkeys(line.colour for line in line_map))
+        self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
+        self.nominal_colours = tuple(LineColour.nominal(name, options.blur) for name in names)
+
+    def align(
+        self,
+        image: NDArray[np.uint8],
+        start: Pose2,
+        colours: tuple[LineColour, ...],
+        *,
+        reach: float = 0.0,
+        prior: tuple[Pose2, Array] | None = None,
+        hopeless: Callable[[Alignment], bool] | None = None,
+    ) -> Alignment | None:
+        """Lay a pose on the image from a start near it.
+
+        :param image: (H, W, 3) uint8 BGR.
+        :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
+            are searched first; 0 is for a start that is most likely right.
+        :param prior: carries the directions that the lines in view do not fix.
+        :param hopeless: whether a pose that will not move any further is refused in any case: one
+            that is comes back as it is, before it has settled.
+        :returns: None where too little of what the start predicts is found, or where the poses do
+            not settle.
+        """
+        pose = start
+        if reach > LINEAR_PX:
+            searched = self._search(image, start, colours, reach, prior)
+            if searched is None:
+                return None
+            pose = searched
+        places = self._predictor.places(pose, SPACING, self._options.stations)
+        if len(places) < _LEAST_STATIONS:
+            return None
+        begun = self._begun(image, places, pose, prior, colours, reach)
+        if begun is None:
+            return None
+        pose, attitude = begun
+        result: Alignment | None = None
+        for k in range(_ITERATIONS):
+            measured = self._measure(
+                image, places, pose, prior, colours, attitude, rough=False)
+            if measured is None:
+                return None
+            known, colours = colours, measured.colours
+            result = alignment_of(measured, self._lines)
+            if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
+                return None
+            step = result.pose.minus(pose)
+            sharpest = min(colour.blur for colour in colours)
+            steady = max(abs(a.blur - b.blur) for a, b in zip(known, colours)) < _LEARNED_BLUR
+            settled = steady and (
+                measured.moved < _SETTLED_BLURS * sharpest or close(
+                    result.pose, pose, result.covariance, _SETTLED))
+            # The first pass learns what tapes look like, and may miss what the next one finds.
+            if hopeless is not None and k > 0 and steady and measured.moved < _NEARLY:
+                settled = settled or hopeless(result)
+            pose, attitude = result.pose, result.refinement.attitude
+            if settled:
+                return result
+            if measured.moved > _MOVED_PX:
+                places = self._predictor.places(pose, SPACING, self._options.stations)
+        if result is None or np.abs(step).max() > _LAST_STEP:
+            return None
+        # Stations that come and go near their thresholds can keep it stepping to and fro.
+        return replace(result, covariance=result.covariance + np.outer(step, step))
+
+    def _begun(
+        self, image: NDArray[np.uint8], places: Places, start: Pose2,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], reach: float,
+    ) -> tuple[Pose2, Array] | None:
+        """The pose and the base's attitude to go on from: after a rough pass, if one is needed.
+
+        None where the start may be off, and too little is found.
+        """
+        level, sharpest = np.zeros(3), min(colour.blur for colour in colours)
+        inexact = sharpest < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
+        if not inexact or len(places) < _ROUGH * _LEAST_STATIONS:
+            return start, level
+        rough = self._measure(
+            image, places.every(_ROUGH), start, prior, colours, level, rough=True)
+        if rough is None:
+            return None if reach > 0.0 else (start, level)
+        # What profiles bear needs no bands of its own.
+        leans = np.abs(rough.leant).max() > _SETTLED_BLURS * sharpest
+        return rough.refinement.pose, rough.refinement.attitude if leans else level
+
+    def _fit(
+        self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...], rough: bool,
+    ) -> tuple[ProfileFit, tuple[LineColour, ...]]:
+        """Fit the bands of each colour with that colour."""
+        if len(colours) == 1:
+            fit, learned = fit_profiles(image, bands, colours[0], rough=rough)
+            return fit, (learned,)
+        n = len(bands)
+        shift, sigma = np.zeros(n), np.ones(n)
+        found = np.zeros(n, dtype=bool)
+        learned_all = list(colours)
+        for k, colour in enumerate(colours):
+            own = self._colour_of_line[bands.label] == k
+            if own.any():
+                fit, learned_all[k] = fit_profiles(
+                    image, bands[own], colour, rough=rough)
+                shift[own], sigma[own], found[own] = fit.shift, fit.sigma, fit.found
+        return ProfileFit(shift, sigma, found), tuple(learned_all)
+
+    def _search(
+        self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
+        reach: float, prior: tuple[Pose2, Array] | None,
+    ) -> Pose2 | None:
+        places = self._predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
+        bands, slide = self._predictor.bands(places, start)
+        shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
+        for k, colour in enumerate(colours):
+            own = self._colour_of_line[bands.label] == k
+            if own.sum() >= _LEAST_STATIONS:
+                fit = search_profiles(image, bands[own], colour, reach)
+                shift[own], found[own] = fit.shift, fit.found
+        if found.sum() < _LEAST_STATIONS:
+            return None
+        return self._solved(
+            shift[found], np.ones(int(found.sum())), slide[found], np.flatnonzero(found),
+            bands.label[found], bands.across[found], start, prior).pose
+
+    def _solved(
+        self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp],
+        label: NDArray[np.intp], across: Array | None, start: Pose2,
+        prior: tuple[Pose2, Array] | None,
+    ) -> Refinement:
+        options = self._options
+        return solve_shifts(
+            shift, sigma, slide, group, label, start, prior=prior,
+            attitude_sigma=(options.height_sigma, options.tilt_sigma),
+            image_shift=across, calibration_sigma=options.calibration_sigma)
+
+    def _measure(
+        self, image: NDArray[np.uint8], places: Places, start: Pose2,
+        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], attitude: Array, *,
+        rough: bool,
+    ) -> Pass | None:
+        """Measure stations where a pose predicts them, and solve; None with too few of them.
+
+        :param attitude: the base's (z, roll, pitch) off its plane as known so far (3,): what is
+            measured from there is small, and a profile is true to small shifts only.
+        """
+        bands, slide = self._predictor.bands(places, start, attitude)
+        if len(bands) < _LEAST_STATIONS:
+            return None
+        fit, colours = self._fit(image, bands, colours, rough)
+        used, = (fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)).nonzero()
+        if len(used) < _LEAST_STATIONS:
+            return None
+        if not rough and float(bands.spacing.take(used).sum()) < _LEAST_LENGTH:
+            return None
+        by_pose, by_attitude = slide.T[:3], slide.T[3:]
+        refinement = self._solved(
+            (fit.shift + attitude.dot(by_attitude)).take(used), fit.sigma.take(used),
+            slide.T.take(used, axis=1).T, used // bands.members, bands.label.take(used),
+            bands.across.take(used, axis=0) if self._options.calibration_sigma > 0.0 else None,
+            start, prior)
+        leant = (refinement.attitude - attitude).dot(by_attitude)
+        moved = refinement.pose.minus(start).dot(by_pose) + leant
+        return Pass(
+            refinement, bands, fit, used, float(np.abs(moved).max()), leant, colours)
