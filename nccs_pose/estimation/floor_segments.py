@@ -123,39 +123,47 @@ def floor_segments(
     points = points[kept]
     points = replace(points, weight=points.weight * share[points.blob])
     near = points.near(normals, offsets, width)
-    support = (points.weight.astype(np.float32) @ near).astype(float)
     free = np.ones(len(points.floor), dtype=bool)
+    # Of each point what it counts, and one; and of each line what its free points do.
+    counts = np.array([points.weight, free], np.float32)
+    support, starts = (counts @ near).astype(float)
     segments: list[FloorSegment] = []
     futile: set[bytes] = set()
     while len(segments) < most:
+        support[starts < _LEAST_START] = -np.inf
         best = int(support.argmax())
         if support[best] < _LEAST_PIXELS:
             break
         support[best] = -np.inf
-        start = np.flatnonzero((near[:, best] > 0.0) & free)
+        start, = ((near[:, best] > 0.0) & free).nonzero()
         # Many lines through one small thing start from the very same points.
-        if len(start) < _LEAST_START or start.tobytes() in futile:
+        if start.tobytes() in futile:
             continue
-        found = _strip(points, free, start, width)
-        if found is None:
+        strip = _strip(points, free, start, width)
+        if strip is None:
             futile.add(start.tobytes())
             continue
+        if strip.length < _LEAST_LENGTH:
+            # Nor does any line run on that starts from points of a thing so short alone.
+            support[starts == near[strip.inside].sum(axis=0)] = -np.inf
+            continue
         futile.clear()
-        line, along, inside, beside = found
-        if _stands_free(points, along, inside, beside, width):
-            inside = _one_tape(points, along, inside, longest)
-            run = along[inside]
-            ends = line.at(run.min()), line.at(run.max())
+        beside = strip.beside(points)
+        if _stands_free(points, strip, beside, width):
+            taken = _one_tape(points, strip.along, strip.inside, longest)
+            run = strip.along[taken]
+            ends = strip.line.at(run.min()), strip.line.at(run.max())
             segments.append(FloorSegment(
-                line.normal, line.offset, *ends, float(points.weight[inside].sum()),
-                upper_median(line.footprint(points.spread[inside])),
-                segmentation.pixels[kept[inside]], colour, segmentation.pitch))
-            taken = inside
+                strip.line.normal, strip.line.offset, *ends, float(points.weight[taken].sum()),
+                upper_median(strip.line.footprint(points.spread[taken])),
+                segmentation.pixels[kept[taken]], colour, segmentation.pitch))
         else:
             # What is left of a solid must not pass for a thinner thing.
-            taken = np.union1d(inside, beside[free[beside]])
+            taken = np.union1d(strip.inside, beside[free[beside]])
         free[taken] = False
-        support -= points.weight[taken].astype(np.float32) @ near[taken]
+        fewer = counts[:, taken] @ near[taken]
+        support -= fewer[0]
+        starts -= fewer[1]
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
 
@@ -202,51 +210,74 @@ def _through_neighbours(part: FloorPoints, seeds: int, width: float) -> tuple[Ar
     return normals[strip], offsets[strip]
 
 
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """A strip of P points' own.
+
+    :ivar along: how far along its line all points are (P,), metres.
+    :ivar beyond: how far they are from being its own (P,), metres; below 0 they may be.
+    :ivar inside: which are.
+    :ivar low: where it begins along its line, metres.
+    :ivar high: where it ends.
+    """
+
+    line: FloorLine
+    along: Array
+    beyond: Array
+    inside: NDArray[np.intp]
+    low: float
+    high: float
+
+    @property
+    def length(self) -> float:
+        """From end to end, metres."""
+        return self.high - self.low
+
+    def beside(self, points: FloorPoints) -> NDArray[np.intp]:
+        """Points of its blobs that lie just beside it."""
+        along, beyond = self.along, self.beyond
+        beside, = ((beyond > 0.0) & (beyond < _BESIDE + points.apart)
+                   & (along > self.low) & (along < self.high)).nonzero()
+        if len(beside) == 0:
+            return beside
+        # Only what hangs together with the strip counts: another tape may well cross it.
+        own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
+        own[points.blob[self.inside]] = True
+        return beside[own[points.blob[beside]]]
+
+
 def _strip(
     points: FloorPoints, free: NDArray[np.bool_], inside: NDArray[np.intp], width: float,
-) -> tuple[FloorLine, Array, NDArray[np.intp], NDArray[np.intp]] | None:
-    """Refine a strip on its own pixels.
+) -> _Strip | None:
+    """Refine a strip on its own pixels; None where too little is left.
 
     :param inside: points to start from.
-    :returns: its line, how far along that all points are (P,), metres, its own points and those
-        of its blobs that lie just beside it; None where too little is left.
     """
     for _ in range(2):
         line = FloorLine.through(points.moments.take(inside, axis=0).sum(axis=0))
         along, beyond = line.places(points, width)
         before = inside
-        inside = np.flatnonzero((beyond < 0.0) & free)
+        inside, = ((beyond < 0.0) & free).nonzero()
         if len(inside) >= _LEAST_SAMPLES:
             inside = _longest_run(points, along, inside, _LONGEST_GAP)
         if len(inside) < _LEAST_SAMPLES or points.weight[inside].sum() < _LEAST_PIXELS:
             return None
         if len(inside) == len(before) and bool((inside == before).all()):
             break
-    low, high = along[inside].min(), along[inside].max()
-    if high - low < _LEAST_LENGTH:
-        return None
-    # Only what hangs together with the strip counts: another tape may well cross it.
-    beside = np.flatnonzero(
-        (beyond > 0.0) & (beyond < _BESIDE + points.apart) & (along > low) & (along < high))
-    if len(beside) > 0:
-        own = np.zeros(int(points.blob[-1]) + 1, dtype=bool)
-        own[points.blob[inside]] = True
-        beside = beside[own[points.blob[beside]]]
-    return line, along, inside, beside
+    run = along[inside]
+    return _Strip(line, along, beyond, inside, float(run.min()), float(run.max()))
 
 
 def _stands_free(
-    points: FloorPoints, along: Array, inside: NDArray[np.intp], beside: NDArray[np.intp],
-    width: float,
+    points: FloorPoints, strip: _Strip, beside: NDArray[np.intp], width: float,
 ) -> bool:
     """Whether a strip has little beside it, or nothing for so long as a line has to be.
 
     Other tapes that cross it, however many, leave it free between them; a solid does not.
 
-    :param along: the strip's direction, of all points (P,), metres.
-    :param inside: its points.
-    :param beside: those beside it.
+    :param beside: the points beside it.
     """
+    along, inside = strip.along, strip.inside
     weight = points.weight[inside]
     if points.weight[beside].sum() <= _MOST_BESIDE * weight.sum():
         return True
@@ -277,9 +308,9 @@ def _longest_run(
     """
     order = inside[np.argsort(along[inside], kind='stable')]
     run = along[order]
-    gaps = np.flatnonzero(run[1:] - run[:-1] > longest_gap) + 1
+    gaps, = (run[1:] - run[:-1] > longest_gap).nonzero()
     if len(gaps) == 0:
         return inside
-    bounds = [0, *gaps.tolist(), len(order)]
+    bounds = [0, *(gaps + 1).tolist(), len(order)]
     heaviest = int(np.add.reduceat(points.weight[order], bounds[:-1]).argmax())
     return np.sort(order[bounds[heaviest]:bounds[heaviest + 1]])
