@@ -247,6 +247,24 @@ def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
     assert len(candidates) <= 300
 
 
+def test_where_many_hundreds_of_places_are_equal_all_are_told(table: FloorTable) -> None:
+    places = np.arange(21.0)
+    line_map = LineMap((*(_line((0.0, y), (20.0, y)) for y in places),
+                        *(_line((x, 0.0), (x, 20.0)) for x in places)))
+    pose = Pose2(10.3, 9.6, 0.7)
+    associator = Associator(line_map, table)
+    candidates = associator.candidates(_strips(line_map, pose, np.random.default_rng(26)))
+    assert len(candidates) <= 300
+    told = [*(c.pose for c in candidates), *associator.others.listed()]
+    for i, j, turns in itertools.product(range(-4, 5), range(-4, 5), range(4)):
+        turn = Pose2(10.0, 10.0, turns * np.pi / 2.0) @ Pose2(-10.0, -10.0, 0.0)
+        place = Pose2(float(i), float(j), 0.0) @ turn @ pose
+        assert any(_near(other, place, 0.25, 0.1) for other in told)
+    # Of other strips, others.
+    associator.candidates(_strips(line_map, Pose2(1.0, 1.0, 0.3), np.random.default_rng(27))[:1])
+    assert associator.others.listed() == []
+
+
 def test_one_strip_across_many_heavier_ones_is_enough(table: FloorTable) -> None:
     spacing = np.cumsum([0.0, 0.3, 0.35, 0.25, 0.4, 0.3, 0.45, 0.3, 0.5])
     line_map = LineMap((

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,7 @@ from typing import Any
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.judge import Found
 from nccs_pose.estimation.ledger import Ledger
+from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
@@ -35,15 +37,24 @@ HERE, THERE, NOWHERE = Pose2(1.0, 0.0, 0.0), Pose2(4.0, 2.0, 1.0), Pose2(-3.0, 2
 
 
 def _alignment(pose: Pose2) -> Any:
-    return SimpleNamespace(pose=pose)
+    return SimpleNamespace(pose=pose, support=np.ones(2), explained=0.5)
 
 
 def _found(pose: Pose2, score: float, by_strips: float = 0.8) -> Found:
     return Found(_alignment(pose), 1.0, score, by_strips)
 
 
-def _strips(pose: Pose2, score: float) -> FittedCandidate:
-    return FittedCandidate(pose, score, 1.0)
+def _strips(
+    pose: Pose2, score: float, claimed: float = 1.0, misfit: float = 0.0,
+) -> FittedCandidate:
+    return FittedCandidate(pose, score, claimed, misfit)
+
+
+def _ledger(
+    symmetries: tuple[Pose2, ...], told: Told | None, left: Sequence[FittedCandidate],
+    others: Sequence[Pose2] = (),
+) -> Ledger:
+    return Ledger(symmetries, told, RATIO, left, Poses.of(others))
 
 
 def _told(pose: Pose2) -> Told:
@@ -51,7 +62,7 @@ def _told(pose: Pose2) -> Told:
 
 
 def test_a_pose_is_known_with_its_twins() -> None:
-    ledger = Ledger((HALF_TURN,), None, RATIO, ())
+    ledger = _ledger((HALF_TURN,), None, ())
     assert not ledger.knows(HERE)
     ledger.refuse(AWAY, _alignment(HERE))
     assert ledger.knows(HERE) and ledger.was_laid(HERE)
@@ -63,8 +74,8 @@ def test_a_pose_is_known_with_its_twins() -> None:
 
 def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
     twin = HALF_TURN @ HERE
-    assert Ledger((HALF_TURN,), None, RATIO, ()).hold(_found(HERE, 0.9), 0.0) == []
-    ledger = Ledger((HALF_TURN,), _told(twin), RATIO, ())
+    assert _ledger((HALF_TURN,), None, ()).hold(_found(HERE, 0.9), 0.0) == []
+    ledger = _ledger((HALF_TURN,), _told(twin), ())
     assert ledger.hold(_found(HERE, 0.9), 0.0) == [twin]
     assert not ledger.knows(twin)
     assert ledger.closed().open == []
@@ -72,7 +83,7 @@ def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
 
 def test_what_holds_leaves_its_twins_open() -> None:
     for told in (None, _told(HERE)):
-        ledger = Ledger((HALF_TURN,), told, RATIO, ())
+        ledger = _ledger((HALF_TURN,), told, ())
         ledger.hold(_found(HERE, 0.9), 0.0)
         twin, = ledger.closed().open
         assert twin.pose == HALF_TURN @ HERE
@@ -81,7 +92,7 @@ def test_what_holds_leaves_its_twins_open() -> None:
 
 def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() -> None:
     left = [_strips(THERE, 0.7), _strips(NOWHERE, 0.6), _strips(HERE, 0.8)]
-    ledger = Ledger((), None, RATIO, left)
+    ledger = _ledger((), None, left)
     assert ledger.closed().open == []
     ledger.hold(_found(HERE, 0.9, by_strips=0.8), 0.0)
     ledger.leave(_strips(HALF_TURN @ HERE, 0.95))
@@ -91,9 +102,39 @@ def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() 
     assert opened[1].score == 0.7 / 0.8 * 0.9
 
 
+def test_of_the_others_those_of_which_more_may_be_there_are_the_rest() -> None:
+    away = [Pose2(8.0, float(k), 0.0) for k in range(4)]
+    ledger = _ledger((), None, [
+        _strips(THERE, 0.6), _strips(away[0], 0.6, claimed=0.9), _strips(away[1], 0.4),
+        _strips(away[3], 0.7)], [HERE, NOWHERE])
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), 0.5)
+    ledger.pass_over(_strips(away[2], 0.6, misfit=1.5))
+    sifted = ledger.closed()
+    # One leaves strips unexplained, and one shows too little.
+    assert [c.pose for c in sifted.rest] == [THERE, away[2]]
+    assert [c.score for c in sifted.rest] == [0.6, 0.6]
+    assert [c.pose for c in sifted.open] == [away[3]]
+    assert sifted.others.listed() == [NOWHERE]
+
+
+def test_a_pose_is_beaten_by_what_holds_unless_more_of_it_may_be_there() -> None:
+    ledger = _ledger((), None, ())
+    assert not ledger.beats(_strips(THERE, 0.1))
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), 0.5)
+    # 0.85 of 0.8, squared.
+    assert ledger.beats(_strips(THERE, 0.45)) and not ledger.beats(_strips(THERE, 0.47))
+    assert ledger.beats(_strips(THERE, 0.7, misfit=1.0))
+    assert not ledger.beats(_strips(THERE, 0.7, misfit=0.5))
+    plain = _ledger((), None, ())
+    plain.hold(replace(_found(HERE, 0.8), alignment=SimpleNamespace(
+        pose=HERE, support=np.ones(3), explained=1.0)), 0.0)
+    assert plain.beats(_strips(THERE, 0.6, claimed=0.9))
+    assert not plain.beats(_strips(THERE, 0.6, claimed=0.97))
+
+
 def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
     for best, opens in ((0.5, True), (0.9, False)):
-        ledger = Ledger((), None, RATIO, ())
+        ledger = _ledger((), None, ())
         ledger.doubt(AWAY, _found(THERE, 0.6))
         ledger.hold(_found(HERE, best), 0.0)
         sifted = ledger.closed()
@@ -102,12 +143,11 @@ def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
 
 
 def test_the_best_is_first_and_tied_by_its_equals() -> None:
-    ledger = Ledger((), None, RATIO, ())
+    ledger = _ledger((), None, ())
     assert not ledger.is_tied()
     ledger.hold(_found(HERE, 0.7), 0.4)
     ledger.hold(_found(THERE, 0.9), 0.2)
     assert ledger.best is not None and ledger.best.alignment.pose == THERE
-    assert ledger.best_misfit == 0.2
     assert not ledger.is_tied()
     ledger.hold(_found(NOWHERE, 0.8), 0.0)
     assert ledger.is_tied()
@@ -115,7 +155,7 @@ def test_the_best_is_first_and_tied_by_its_equals() -> None:
 
 
 def test_what_something_hides_is_hidden_with_its_twins() -> None:
-    ledger = Ledger((HALF_TURN,), None, RATIO, ())
+    ledger = _ledger((HALF_TURN,), None, ())
     ledger.hide(AWAY, _found(HERE, 0.5, by_strips=0.6))
     ledger.rule_out(_strips(THERE, 0.4), AWAY)
     sifted = ledger.closed()
@@ -126,7 +166,7 @@ def test_what_something_hides_is_hidden_with_its_twins() -> None:
 
 def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_open() -> None:
     for best, lines, opens in ((0.5, 3, True), (0.7, 3, False), (0.5, 2, False)):
-        ledger = Ledger((), None, RATIO, ())
+        ledger = _ledger((), None, ())
         ledger.hold(_found(HERE, best), 0.0)
         ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
             pose=THERE, support=np.ones(lines), explained=1.0)))

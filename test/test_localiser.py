@@ -312,6 +312,23 @@ def test_a_pose_that_is_refused_in_any_case_is_not_laid_to_the_end() -> None:
     assert stopped.pose != settled.pose
 
 
+def test_the_right_one_of_many_hundreds_of_places_is_told() -> None:
+    places = np.arange(-12.0, 13.0)
+    lattice = LineMap((
+        *(_line((-12.0, y), (12.0, y), f'along {y}') for y in places),
+        *(_line((x, -12.0), (x, 12.0), f'across {x}') for x in places)))
+    scene, rng = replace(SCENE, line_map=lattice), np.random.default_rng(8)
+    localiser = Localiser(scene.rig, lattice)
+    for k in range(4):
+        # Near the edge fewer lines are expected, and where they are not seen that looks better.
+        pose = Pose2(*rng.uniform(-10.0, 10.0, 2), float(rng.uniform(-np.pi, np.pi)))
+        localiser.relocalise()
+        estimate = localiser.process((k + 1) * PERIOD_NS, render(scene, pose, rng))
+        assert estimate.state is State.AMBIGUOUS
+        assert any(math.hypot(c.pose.x - pose.x, c.pose.y - pose.y) < 0.2 and abs(
+            float(wrap_angle(c.pose.yaw - pose.yaw))) < 0.1 for c in estimate.candidates)
+
+
 def test_the_places_that_look_the_same_are_told_at_first_sight() -> None:
     scene = replace(SCENE, line_map=GRID)
     pose = Pose2(0.3, -0.4, 0.3)

@@ -38,11 +38,14 @@ from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 
 # Pairs of strips that start hypotheses; of these so many are looked at closely, by every third
-# sample of the strips, and so many are refined. No more than these are told.
+# sample of the strips, and so many are refined. No more than these are candidates.
 _PAIRS = 15
 _CLOSE = 300
 _COARSE = 3
 _REFINED = 24
+# A pose that explains this part of the strips leaves none unexplained.
+ALL_STRIPS = 0.95
+_NONE = Poses(np.zeros(0, complex), np.zeros(0, complex))
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,16 @@ class Associator:
 
     A pose's score is the harmonic mean of two fractions: of the strips' pixels that lie on map
     lines, and of the map lines in view that strips lie on.
+
+    :ivar others: poses that leave no strip unexplained, but were not looked at any closer, for
+        the candidates that were asked for last: where a map has many hundreds of places alike.
     """
 
     def __init__(self, line_map: LineMap, table: FloorTable) -> None:
         lines = FloorLines(line_map)
         self._place = Place(lines, NearestLines(lines), FloorScale(table))
         self._last: StripScorer | None = None
+        self.others = _NONE
 
     def candidates(
         self, segments: tuple[FloorSegment, ...], told: Told | None = None,
@@ -81,6 +88,7 @@ class Associator:
         :param told: where the robot is by something else; poses there are not left out for others
             that explain as much.
         """
+        self.others = _NONE
         if len(segments) < 2:
             return ()
         scorer = self._scorer(segments)
@@ -89,7 +97,7 @@ class Associator:
             return ()
         guessed: list[FittedCandidate] = []
         if len(poses.place) > _REFINED:
-            poses, guessed = _promising(scorer, poses, told)
+            poses, guessed, self.others = _promising(scorer, poses, told)
         poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
         found = distinct(poses, score)
@@ -120,20 +128,26 @@ class Associator:
 
 def _promising(
     scorer: StripScorer, poses: Poses, told: Told | None,
-) -> tuple[Poses, list[FittedCandidate]]:
-    """Of many poses those that are worth refining, and the others that show as much."""
+) -> tuple[Poses, list[FittedCandidate], Poses]:
+    """Of many poses those that are worth refining, and others that show as much.
+
+    :returns: those, others that were looked at, and others that leave no strip unexplained.
+    """
     claimed = scorer.claimed(poses, _COARSE)
     there = np.zeros(len(claimed), dtype=bool) if told is None else (
         told.holds_guesses(poses.place, poses.rotation))
     best = np.lexsort([-claimed, ~there])
     if len(best) > _CLOSE:
-        best = one_of_each(poses, best)[:_CLOSE]
+        best = one_of_each(poses, best)
+    further = best[_CLOSE:]
+    others = poses[further[claimed[further] > ALL_STRIPS]]
+    best = best[:_CLOSE]
     poses, claimed, there = poses[best], claimed[best], there[best]
     score = _harmonic(claimed, scorer.explained(poses, _COARSE))
     found = sorted(distinct(poses, score), key=lambda k: not there[k])
-    others = found[_REFINED:]
+    guessed = found[_REFINED:]
     return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
-        poses[others].listed(), score[others].tolist(), claimed[others].tolist())]
+        poses[guessed].listed(), score[guessed].tolist(), claimed[guessed].tolist())], others
 
 
 def _harmonic(a: Array, b: Array) -> Array:

@@ -75,4 +75,9 @@ def left_open(
     carried_on = (best, *others[:_CARRIED - 1])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-    return carried_on, others[_CARRIED - 1:]
+    more = others[_CARRIED - 1:] + [Hypothesis(c.pose, (before * c.score,)) for c in sifted.rest]
+    if len(sifted.others.place) > 0:
+        # They show no more than the least of what was looked at closely, for all that is known.
+        least = min((*others, *more), key=lambda h: h.mean, default=best).scores
+        more += (Hypothesis(pose, least) for pose in sifted.others.listed())
+    return carried_on, more

@@ -42,9 +42,8 @@ class State(Enum):
     AMBIGUOUS = 'ambiguous', (
         'Two poses or more explain the image, and the second scores more than `ambiguity_ratio` '
         'of the best, in the mean of all images since they were first seen. All are candidates, '
-        'the best first, none is given. On a map with many places alike these are hundreds: at '
-        'most 300 from the strips of an image, those that explain it best, and what was carried '
-        'on from the images before.')
+        'the best first, none is given. On a map with many places alike these are hundreds: '
+        'all that the strips of an image show, and what was carried on from the images before.')
     TRACKING = 'tracking', (
         'The pose explains the image: at least `least_explained` of the predicted line pixels '
         'are found, no line and no stretch of lines lies off by more than `largest_misfit`, no '

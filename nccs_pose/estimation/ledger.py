@@ -18,15 +18,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+import math
 
 from nccs_pose.estimation.alignment import Alignment
-from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.estimate import Candidate
-from nccs_pose.estimation.judge import explains_nearly_all, Found
-from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found
+from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
+
+# A pose that leaves more of the strips unexplained than another by this much is no rival of it: of
+# wrong poses that such an image seemed to show the right one explained as much or more.
+AS_MUCH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +51,17 @@ class Sifted:
     :ivar refused: the others, the best first.
     :ivar open: poses that may explain it as well as the best of those that hold, but were not
         laid on it, or that it cannot tell from another; their scores are no higher than its.
+    :ivar rest: poses that may explain it as well, if more of their lines is there than the strips
+        show; they were not laid on it either.
+    :ivar others: poses of which the strips show all that they show of these, and no more is known.
     """
 
     held: list[Found]
     hidden: list[Candidate]
     refused: list[Refused]
     open: list[Candidate]
+    rest: list[Candidate]
+    others: Poses
 
 
 class Ledger:
@@ -60,12 +70,11 @@ class Ledger:
     A symmetric map has twins of every pose, of which the image shows the same.
 
     :ivar best: of the poses that hold, None if none does.
-    :ivar best_misfit: how far the strips lay off the lines where it was begun from, px.
     """
 
     def __init__(
         self, symmetries: Sequence[Pose2], told: Told | None, ratio: float,
-        left: Iterable[FittedCandidate],
+        left: Iterable[FittedCandidate], others: Poses,
     ) -> None:
         """Begin.
 
@@ -74,9 +83,10 @@ class Ledger:
             learned of a twin by laying it on the image too.
         :param ratio: a pose that scores this part of the best is its equal.
         :param left: candidates that are not to be laid on the image.
+        :param others: poses that leave no strip unexplained, besides the candidates.
         """
         self.best: Found | None = None
-        self.best_misfit = 0.0
+        self._best_misfit = 0.0
         self._symmetries = symmetries
         self._told = told
         self._ratio = ratio
@@ -94,6 +104,8 @@ class Ledger:
         # Twins of what holds that are not laid on the image themselves.
         self._equal: list[Pose2] = []
         self._left = list(left)
+        self._beaten: list[FittedCandidate] = []
+        self._others = others
 
     def knows(self, pose: Pose2) -> bool:
         """Whether a pose need not be laid on the image: it or its twin was."""
@@ -108,9 +120,30 @@ class Ledger:
         return self.best is not None and len(
             [f for f in self._held if f.score >= self._ratio * self.best.score]) > 1
 
+    def beats(self, strips: FittedCandidate) -> bool:
+        """Whether what strips show of a pose leaves it no chance against the best that holds.
+
+        No pose scores more on the image than the root of what it scores on the strips, times
+        what is left of that by how far they lie off its lines; and where the strips show all that
+        the pose that holds expects, and nothing else, they tell rivals as well as the image: but
+        for one that leaves no strip unexplained, of which more may be there than the strips show.
+        """
+        best, ratio = self.best, self._ratio
+        if best is None:
+            return False
+        if explains_nearly_all(best) and strips.score < ratio * best.by_strips and (
+                strips.claimed < ALL_STRIPS):
+            return True
+        excess = max(strips.misfit**2 - self._best_misfit**2, 0.0)
+        return math.sqrt(strips.score) * fit_of(excess) < ratio * best.score
+
     def leave(self, strips: FittedCandidate) -> None:
         """Leave a candidate that was not laid on the image."""
         self._left.append(strips)
+
+    def pass_over(self, strips: FittedCandidate) -> None:
+        """Leave a candidate that the best pose beats; see :meth:`beats`."""
+        self._beaten.append(strips)
 
     def rule_out(self, strips: FittedCandidate, against: Objection) -> None:
         """Refuse a candidate by its strips alone, unless something is hidden."""
@@ -131,7 +164,7 @@ class Ledger:
         self._settle_twins(found.alignment.pose)
         self._held.append(found)
         if self.best is None or found.score > self.best.score:
-            self.best, self.best_misfit = found, misfit
+            self.best, self._best_misfit = found, misfit
         twins, told = self._twins(found.alignment.pose), self._told
         there = [told is not None and told.holds(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
@@ -160,8 +193,19 @@ class Ledger:
     def closed(self) -> Sifted:
         """What is left when no more poses are laid on the image."""
         held = sorted(self._held, key=lambda f: -f.score)
-        left_open = [] if self.best is None else self._open(held, self.best)
-        return Sifted(held, self._hidden, self._refused, left_open)
+        if self.best is None:
+            return Sifted(held, self._hidden, self._refused, [], [], self._others)
+        poses = [f.alignment.pose for f in held]
+        left_open = self._open(poses, self.best)
+        known = Poses.of([*poses, *self._laid])
+        least = self._ratio * self.best.by_strips
+        left_open += self._unlaid([c for c in self._left if c.score >= least], known, self.best)
+        rest = self._unlaid(
+            [c for c in (*self._left, *self._beaten) if self._may_show(c, self.best)],
+            Poses.of([*poses, *self._laid, *(c.pose for c in left_open)]), self.best)
+        return Sifted(
+            held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score),
+            rest, self._others[unlike(self._others, known)])
 
     def _twins(self, pose: Pose2) -> list[Pose2]:
         return [s @ pose for s in self._symmetries]
@@ -170,8 +214,11 @@ class Ledger:
         if self._told is None:
             self._settled += self._twins(pose)
 
-    def _open(self, held: list[Found], best: Found) -> list[Candidate]:
-        """The poses that are left open beside those that hold; hides the doubtful that are not."""
+    def _open(self, known: list[Pose2], best: Found) -> list[Candidate]:
+        """Poses that were laid on the image, or their twins, and are left open; hides others.
+
+        :param known: those that hold; what is left open is added.
+        """
         # What explains nearly all, and more than the best does, leaves that in doubt.
         found = [Candidate(excused.alignment.pose, best.score)
                  for excused in self._excused
@@ -183,15 +230,25 @@ class Ledger:
             else:
                 self._hidden.append(Candidate(pose, doubtful.by_strips))
         # A twin shows what the pose that holds does, even if it was laid on the image and refused.
-        known = [f.alignment.pose for f in held]
         for twin in self._equal:
             if not any(same_pose(twin, pose) for pose in known):
                 known.append(twin)
                 found.append(Candidate(twin, best.score))
-        known += self._laid
-        # Candidates differ among themselves.
-        for strips in self._left:
-            share = min(strips.score / best.by_strips, 1.0)
-            if share >= self._ratio and not any(same_pose(strips.pose, p) for p in known):
-                found.append(Candidate(strips.pose, share * best.score))
-        return sorted(found, key=lambda candidate: -candidate.score)
+        return found
+
+    def _may_show(self, strips: FittedCandidate, best: Found) -> bool:
+        """Whether a pose explains what the best does, and all of its lines may be there."""
+        return (strips.claimed > best.claimed - AS_MUCH
+                and math.sqrt(strips.score) >= self._ratio * best.score)
+
+    def _unlaid(
+        self, left: list[FittedCandidate], known: Poses, best: Found,
+    ) -> list[Candidate]:
+        """Candidates that were not laid on the image, nor their likes."""
+        if not left:
+            return []
+        # They differ among themselves.
+        new = unlike(Poses.of([strips.pose for strips in left]), known)
+        return [
+            Candidate(strips.pose, min(strips.score / best.by_strips, 1.0) * best.score)
+            for strips, differs in zip(left, new.tolist()) if differs]

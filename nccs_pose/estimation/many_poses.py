@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -23,6 +24,7 @@ from nccs_pose.geometry.floor_table import Complex
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 # Poses this close are the same, metres and rad.
 _SAME_PLACE = 0.25
@@ -36,7 +38,13 @@ class Poses:
     rotation: Complex
     place: Complex
 
-    def __getitem__(self, index: NDArray[np.intp] | list[int]) -> Poses:
+    @classmethod
+    def of(cls, poses: Sequence[Pose2]) -> Poses:
+        """From each of them."""
+        x, y, yaw = np.array([(pose.x, pose.y, pose.yaw) for pose in poses]).reshape(-1, 3).T
+        return cls(np.exp(1j * yaw), x + 1j * y)
+
+    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int]) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
     def listed(self) -> list[Pose2]:
@@ -49,6 +57,13 @@ def same_pose(a: Pose2, b: Pose2) -> bool:
     """Whether two poses are close enough to converge to one."""
     return (math.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
             and abs(math.remainder(a.yaw - b.yaw, 2.0 * math.pi)) < SAME_YAW)
+
+
+def unlike(poses: Poses, known: Poses) -> NDArray[np.bool_]:
+    """Which of poses are the same as none that is known (H,)."""
+    near = np.abs(poses.place[:, None] - known.place) < _SAME_PLACE
+    near &= (poses.rotation[:, None] * known.rotation.conj()).real > math.cos(SAME_YAW)
+    return np.logical_not(near.any(axis=1))
 
 
 def one_of_each(poses: Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -65,12 +80,19 @@ def distinct(poses: Poses, score: Array) -> list[int]:
     """The best of each group of poses that are the same, best first."""
     order = np.argsort(-score, kind='stable')
     place, rotation = poses.place[order], poses.rotation[order]
-    apart = place - place[:, None]
-    same = np.square(apart.real) + np.square(apart.imag) < _SAME_PLACE**2
-    same &= (rotation * rotation[:, None].conj()).real > math.cos(SAME_YAW)
-    left = np.ones(len(order), dtype=bool)
+    near = cKDTree(np.column_stack([place.real, place.imag])).query_pairs(
+        _SAME_PLACE, output_type='ndarray')
+    better, worse = near.T
+    same = (rotation[better] * rotation[worse].conj()).real > math.cos(SAME_YAW)
+    better, worse = better[same], worse[same]
     # Most are like no other.
-    for k in (same.sum(axis=1) > 1).nonzero()[0].tolist():
+    if len(better) == 0:
+        return order.tolist()
+    by_better = np.argsort(better, kind='stable')
+    worse = worse[by_better]
+    ranks, first = np.unique(better[by_better], return_index=True)
+    left = np.ones(len(order), dtype=bool)
+    for k, others in zip(ranks.tolist(), np.split(worse, first[1:])):
         if left[k]:
-            left[k + 1:] &= ~same[k, k + 1:]
-    return [int(k) for k in order[left]]
+            left[others] = False
+    return order[left].tolist()

@@ -20,18 +20,17 @@ from collections import deque
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from itertools import islice
-import math
 
 from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found, is_expected, Judge
-from nccs_pose.estimation.ledger import Ledger, Refused, Sifted
+from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge
+from nccs_pose.estimation.ledger import AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.sights import ALL_STRIPS, Sight
+from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
@@ -48,9 +47,6 @@ _WORTH_TRYING = 0.75
 _SHARP = 0.8
 # So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
-# A pose that leaves more of the strips unexplained than another by this much is no rival of it: of
-# wrong poses that such an image seemed to show the right one explained as much or more.
-_AS_MUCH = 0.05
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
@@ -127,16 +123,20 @@ class Sifter:
         candidates, told = case.sight.candidates, case.told
         if told is not None and len(candidates) > _TRIED:
             candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
-        ledger = Ledger(
-            self._symmetries, told, self._options.ambiguity_ratio, candidates[_TRIED:])
+        worth = [c.score >= _WORTH_TRYING * case.sight.promise
+                 or (told is not None and told.holds(c.pose)) for c in candidates[:_TRIED]]
+        ledger = Ledger(self._symmetries, told, self._options.ambiguity_ratio, (
+            *(c for c, good in zip(candidates, worth) if not good), *candidates[_TRIED:]),
+            case.sight.others)
         starts = deque(_Start(h.pose, self._options.band) for h in hypotheses)
-        starts += (_Start.of(c) for c in candidates[:_TRIED]
-                   if c.score >= _WORTH_TRYING * case.sight.promise
-                   or (told is not None and told.holds(c.pose)))
+        starts += (_Start.of(c) for c, good in zip(candidates, worth) if good)
         undecided = False
         while starts:
             start = starts.popleft()
-            if ledger.knows(start.pose) or self._is_beaten(start, ledger):
+            if ledger.knows(start.pose):
+                continue
+            if start.strips is not None and ledger.beats(start.strips):
+                ledger.pass_over(start.strips)
                 continue
             if undecided:
                 # What the image shows of the hypotheses is among the candidates.
@@ -261,24 +261,6 @@ class Sifter:
             return found
         least = self._options.ambiguity_ratio * found.by_strips
         rivals = any(
-            c.score >= least and c.claimed > found.claimed - _AS_MUCH and not same_pose(
+            c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
                 c.pose, alignment.pose) for c in candidates)
         return _DOUBTFUL if rivals else found
-
-    def _is_beaten(self, start: _Start, ledger: Ledger) -> bool:
-        """Whether what a pose shows on the strips leaves it no chance against the best that holds.
-
-        No pose scores more on the image than the root of what it scores on the strips, times
-        what is left of that by how far they lie off its lines; and where the strips show all that
-        the pose that holds expects, and nothing else, they tell rivals as well as the image: but
-        for one that leaves no strip unexplained, of which more may be there than the strips show.
-        """
-        best, strips = ledger.best, start.strips
-        if best is None or strips is None:
-            return False
-        ratio = self._options.ambiguity_ratio
-        if explains_nearly_all(best) and strips.score < ratio * best.by_strips and (
-                strips.claimed < ALL_STRIPS):
-            return True
-        excess = max(strips.misfit**2 - ledger.best_misfit**2, 0.0)
-        return math.sqrt(strips.score) * fit_of(excess) < ratio * best.score

@@ -19,8 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.told import Told
 from nccs_pose.vision.colour import LineColour
@@ -31,8 +32,6 @@ from numpy.typing import NDArray
 # the next scores less than this part of it.
 _PLAIN = 0.8
 _RIVAL = 0.8
-# A pose that explains this part of the strips leaves none unexplained.
-ALL_STRIPS = 0.95
 # A place is one of many when more poses than this score so and leave none of so many strips
 # unexplained.
 _MANY = 6
@@ -46,12 +45,14 @@ class Sight:
     :ivar image: (H, W, 3) uint8 BGR.
     :ivar segments: the strips in it.
     :ivar candidates: poses that explain them, best first.
+    :ivar others: poses that leave no strip unexplained, but were not looked at as closely.
     :ivar colours: what tapes look like to begin with.
     """
 
     image: NDArray[np.uint8]
     segments: tuple[FloorSegment, ...]
     candidates: tuple[FittedCandidate, ...]
+    others: Poses
     colours: tuple[LineColour, ...]
 
     @property
@@ -99,7 +100,8 @@ def sights(
         if best is not None and segments is best.segments:
             continue
         lap('detect')
-        sight = Sight(image, segments, searcher.candidates(segments, told), shown)
+        sight = Sight(
+            image, segments, searcher.candidates(segments, told), searcher.others, shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight

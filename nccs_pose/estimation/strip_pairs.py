@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 # A map of many equal places gives no end of hypotheses: those of the heaviest strips are enough.
 _ENOUGH = 1500
+# So many and no fewer are laid at once.
+_AT_ONCE = 500
 # A strip with each of those that are heavier, and then the next; no image has more of them.
 _BY_WEIGHT = np.tril_indices(128, -1)
 # Two lines must differ by this angle to cross usefully, rad.
@@ -120,7 +122,7 @@ def poses_of_pairs(
     found, laid = [], 0
     # Whole pairs of strips: any of them may be the one that is not what it seems.
     ends = np.flatnonzero(pair[1:] > pair[:-1]) + 1
-    cuts = ends if len(pair) > _ENOUGH else ends[:0]
+    cuts = ends[ends // _AT_ONCE > np.append(0, ends[:-1]) // _AT_ONCE]
     for part in np.split(np.arange(len(pair)), cuts):
         one, other = first[pair[part]], second[pair[part]]
         found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))

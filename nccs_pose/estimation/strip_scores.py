@@ -23,6 +23,7 @@ from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, StripLines
 from nccs_pose.geometry.floor_scale import FloorScale
+from nccs_pose.geometry.floor_table import Complex
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.small_matrices import definite_solutions
 import numpy as np
@@ -35,6 +36,11 @@ _SAMPLES = 12
 _LONGEST_SAMPLE = 60.0
 # Fewer samples than this on lines refine no pose.
 _LEAST_SAMPLES = 4
+# Of more than so many lines only those that lie differently to the robot are looked at: those
+# that begin, end and point within so much of each other look the same, metres and rad.
+_MANY = 2000
+_SAME_PLACE = 0.01
+_SAME_ANGLE = 0.005
 # What keeps a direction that no sample fixes where it is.
 _DAMPING = 1e-6 * np.eye(3)
 
@@ -108,6 +114,26 @@ class StripScorer:
         to_base = poses.rotation[pose].conj()
         along = lines.direction[line] * to_base
         begin = (lines.start[line] - poses.place[pose]) * to_base + first * along
+        if len(begin) > _MANY:
+            # On a map that repeats itself many poses see lines in the very same places.
+            ones, kind = _one_of_each(begin, length, along)
+            total, covered = (part[kind] for part in self._seen(
+                begin[ones], length[ones], along[ones], share))
+        else:
+            total, covered = self._seen(begin, length, along, share)
+        count = len(poses.place)
+        return np.bincount(pose, covered, count) / np.maximum(
+            np.bincount(pose, total, count), 1e-9)
+
+    def _seen(
+        self, begin: Complex, length: Array, along: Complex, share: Array,
+    ) -> tuple[Array, Array]:
+        """How much of the image lines fill, and how much of that strips lie on (K,), px.
+
+        :param begin: where they begin in base_link, x + iy (K,), metres.
+        :param along: their directions, unit (K,).
+        :param share: which parts of their lengths are looked at.
+        """
         points = begin[:, None] + (length * along)[:, None] * share
         # A metre of tape far away fills fewer pixels: count it by its length in the image.
         weight = np.minimum(
@@ -117,10 +143,7 @@ class StripScorer:
         off = self._frames @ at.reshape(3, -1)
         inside = np.abs(off, out=off) < 1.0
         on = (inside[:len(inside) // 2] & inside[len(inside) // 2:]).any(axis=0)
-        covered = weight * on.reshape(weight.shape)
-        count = len(poses.place)
-        total = np.bincount(pose, weight.sum(axis=1), count)
-        return np.bincount(pose, covered.sum(axis=1), count) / np.maximum(total, 1e-9)
+        return weight.sum(axis=1), (weight * on.reshape(weight.shape)).sum(axis=1)
 
     def refined(self, poses: Poses) -> tuple[Poses, Array, Array]:
         """Lay the strips on their lines by least squares on the floor, from poses (H,).
@@ -151,3 +174,21 @@ class StripScorer:
         square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
         total = on @ self._weight
         return poses, total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
+
+
+def _one_of_each(
+    begin: Complex, length: Array, along: Complex,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of lines (K,) those that lie differently to the robot, and which of them each is like."""
+    cells = np.rint(np.stack([
+        begin.real / _SAME_PLACE, begin.imag / _SAME_PLACE, length / _SAME_PLACE,
+        np.angle(along) / _SAME_ANGLE])).astype(np.int64)
+    # No line that is near enough to be seen is many thousand cells long or away.
+    number = cells[0] + (cells[1] << 16) + (cells[2] << 32) + (cells[3] << 48)
+    order = number.argsort()
+    number = number[order]
+    differs = np.ones(len(order), dtype=bool)
+    differs[1:] = number[1:] != number[:-1]
+    kind = np.empty(len(order), np.intp)
+    kind[order] = np.cumsum(differs) - 1
+    return order[differs], kind
