@@ -24,7 +24,6 @@ from nccs_pose.geometry.floor_table import Complex
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 # Poses this close are the same, metres and rad.
 _SAME_PLACE = 0.25
@@ -79,20 +78,16 @@ def one_of_each(poses: Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
 def distinct(poses: Poses, score: Array) -> list[int]:
     """The best of each group of poses that are the same, best first."""
     order = np.argsort(-score, kind='stable')
-    place, rotation = poses.place[order], poses.rotation[order]
-    near = cKDTree(np.column_stack([place.real, place.imag])).query_pairs(
-        _SAME_PLACE, output_type='ndarray')
-    better, worse = near.T
-    same = (rotation[better] * rotation[worse].conj()).real > math.cos(SAME_YAW)
-    better, worse = better[same], worse[same]
-    # Most are like no other.
-    if len(better) == 0:
-        return order.tolist()
-    by_better = np.argsort(better, kind='stable')
-    worse = worse[by_better]
-    ranks, first = np.unique(better[by_better], return_index=True)
+    # Products of narrow matrices are far cheaper than differences of all with all.
+    at = np.stack([part[order].view(np.float64).reshape(-1, 2).astype(np.float32)
+                   for part in (poses.place - poses.place.mean(), poses.rotation)])
+    product = at @ at.transpose(0, 2, 1)
+    square = product[0].diagonal()
+    same = square[:, None] + square - 2.0 * product[0] < _SAME_PLACE**2
+    same &= product[1] > math.cos(SAME_YAW)
     left = np.ones(len(order), dtype=bool)
-    for k, others in zip(ranks.tolist(), np.split(worse, first[1:])):
+    # Most are like no other.
+    for k in (same.sum(axis=1) > 1).nonzero()[0].tolist():
         if left[k]:
-            left[others] = False
+            left[k + 1:] &= ~same[k, k + 1:]
     return order[left].tolist()

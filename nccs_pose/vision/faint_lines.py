@@ -88,7 +88,7 @@ def _ridges(
         ridge = cv2.subtract(here, cv2.max(one, other))
         cv2.max(best, ridge, dst=best)
         fainter = _moved(cv2.min(ahead, behind), 0.0, 0.0, aside)
-        goes_on = cv2.compare(fainter, cv2.multiply(here, 0.5 * _GOES_ON), cv2.CMP_GT)
+        goes_on = cv2.compare(fainter, np.float32(0.5 * _GOES_ON) * here, cv2.CMP_GT)
         cv2.max(going_on, cv2.copyTo(ridge, goes_on), dst=going_on)
     return 0.5 * best, 0.5 * going_on
 
