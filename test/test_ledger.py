@@ -102,15 +102,15 @@ def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() 
     assert opened[1].score == 0.7 / 0.8 * 0.9
 
 
-def test_of_the_others_those_of_which_more_may_be_there_are_the_rest() -> None:
+def test_the_others_that_explain_the_strips_are_the_rest() -> None:
     away = [Pose2(8.0, float(k), 0.0) for k in range(4)]
     ledger = _ledger((), None, [
-        _strips(THERE, 0.6), _strips(away[0], 0.6, claimed=0.9), _strips(away[1], 0.4),
-        _strips(away[3], 0.7)], [HERE, NOWHERE])
+        _strips(THERE, 0.6), _strips(away[0], 0.6, claimed=0.9), _strips(away[3], 0.7),
+        _strips(HERE @ Pose2(0.1, 0.1, 0.0), 0.6)], [HERE, NOWHERE])
     ledger.hold(_found(HERE, 0.8, by_strips=0.8), 0.5)
     ledger.pass_over(_strips(away[2], 0.6, misfit=1.5))
     sifted = ledger.closed()
-    # One leaves strips unexplained, and one shows too little.
+    # One leaves strips unexplained, and one is the pose that holds.
     assert [c.pose for c in sifted.rest] == [THERE, away[2]]
     assert [c.score for c in sifted.rest] == [0.6, 0.6]
     assert [c.pose for c in sifted.open] == [away[3]]

@@ -51,8 +51,8 @@ class Sifted:
     :ivar refused: the others, the best first.
     :ivar open: poses that may explain it as well as the best of those that hold, but were not
         laid on it, or that it cannot tell from another; their scores are no higher than its.
-    :ivar rest: poses that may explain it as well, if more of their lines is there than the strips
-        show; they were not laid on it either.
+    :ivar rest: poses that explain the strips as well, but of which these show fewer lines; they
+        were not laid on it either.
     :ivar others: poses of which the strips show all that they show of these, and no more is known.
     """
 
@@ -200,8 +200,10 @@ class Ledger:
         known = Poses.of([*poses, *self._laid])
         least = self._ratio * self.best.by_strips
         left_open += self._unlaid([c for c in self._left if c.score >= least], known, self.best)
+        # More of the lines of what explains the same strips may be there than they show.
         rest = self._unlaid(
-            [c for c in (*self._left, *self._beaten) if self._may_show(c, self.best)],
+            [c for c in (*self._left, *self._beaten)
+             if c.claimed > self.best.claimed - AS_MUCH],
             Poses.of([*poses, *self._laid, *(c.pose for c in left_open)]), self.best)
         return Sifted(
             held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score),
@@ -235,11 +237,6 @@ class Ledger:
                 known.append(twin)
                 found.append(Candidate(twin, best.score))
         return found
-
-    def _may_show(self, strips: FittedCandidate, best: Found) -> bool:
-        """Whether a pose explains what the best does, and all of its lines may be there."""
-        return (strips.claimed > best.claimed - AS_MUCH
-                and math.sqrt(strips.score) >= self._ratio * best.score)
 
     def _unlaid(
         self, left: list[FittedCandidate], known: Poses, best: Found,
