@@ -46,6 +46,7 @@ class Alignment:
     :ivar refinement: the last solve.
     :ivar points: the pixels it rests on, labelled by map line.
     :ivar residual: of the points, whitened (N,).
+    :ivar scale: root mean square residual, as a multiple of the noise.
     :ivar noise: of the image, by which they are whitened (N,), px.
     :ivar explained: fraction of the predicted line pixels that were found.
     :ivar lines: map lines that it rests on.
@@ -62,6 +63,7 @@ class Alignment:
     refinement: Refinement
     points: LinePoints
     residual: Array
+    scale: float
     noise: Array
     explained: float
     lines: tuple[int, ...]
@@ -78,11 +80,6 @@ class Alignment:
         seen = np.bincount(label, minlength=lines)
         return 2.0 * np.bincount(label, self.bands.half_width, lines) / np.where(
             seen > 0, seen, np.nan)
-
-    @cached_property
-    def scale(self) -> float:
-        """Root mean square residual, as a multiple of the noise."""
-        return root_mean_square(self.residual)
 
     @cached_property
     def residual_px(self) -> float:
@@ -118,9 +115,11 @@ def alignment_of(measured: Pass, lines: int) -> Alignment:
     inlier, = refinement.inlier.nonzero()
     index = measured.used.take(inlier)
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.
-    worth = bands.spacing * np.minimum(1.0, bands.half_width)
+    share, spacing = np.minimum(1.0, bands.half_width), bands.spacing
+    explained = spacing.take(index).dot(share.take(index)) / spacing.dot(share)
     residual = refinement.residual.take(inlier)
     sigma, label = fit.sigma.take(index), bands.label.take(index)
+    scale = root_mean_square(residual)
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, members = runs(index // bands.members)
     # Residuals of whole groups, times what noise the group has together.
@@ -130,9 +129,8 @@ def alignment_of(measured: Pass, lines: int) -> Alignment:
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
-        LinePoints(pixels, root_mean_square(residual) * sigma, label), residual, sigma,
-        float(worth.take(index).sum() / worth.sum()),
-        tuple(there.nonzero()[0].tolist()), _missing(bands, index),
+        LinePoints(pixels, scale * sigma, label), residual, scale, sigma,
+        float(explained), tuple(there.nonzero()[0].tolist()), _missing(bands, index),
         there / np.where(seen > 0, seen, np.nan), misfit, measured.colours, bands)
 
 

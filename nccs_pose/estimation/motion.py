@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import cached_property
 import math
 
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2, wrapped
 from nccs_pose.geometry.small_matrices import inverse, inverse_3x3
 import numpy as np
 
@@ -88,7 +88,7 @@ class Prediction:
         """
         prior = self.covariance
         gain = solved.dot(inverse(prior))
-        multiple = max(1.0, float(covariance.trace() / solved.trace()))
+        multiple = max(1.0, _trace(covariance) / _trace(solved))
         narrowed = covariance - gain.dot(multiple * prior - self.carried).dot(gain.T)
         return covariance if inverse_3x3(narrowed) is None else narrowed
 
@@ -129,8 +129,9 @@ class Odometry:
         if beyond > _LONGEST_GAP_NS or t1 - t0 > 4 * _LONGEST_GAP_NS:
             return None
         share = (stamp_ns - t0) / (t1 - t0)
-        step = self._poses[left].inverse() @ self._poses[right]
-        return self._poses[left] @ Pose2(share * step.x, share * step.y, share * step.yaw)
+        a, b = self._poses[left], self._poses[right]
+        return Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y),
+                     a.yaw + share * wrapped(b.yaw - a.yaw))
 
 
 def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> Prediction:
@@ -162,11 +163,16 @@ def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction 
         return None
     twist = before.pose.inverse() @ last.pose
     share = dt / past
-    step = Pose2(share * twist.x, share * twist.y, share * float(wrap_angle(twist.yaw)))
+    step = Pose2(share * twist.x, share * twist.y, share * twist.yaw)
     moved = last.pose @ step
     sigma, sigma_yaw = (0.5 * a * blind * (blind + past) for a in _ACCELERATION)
     return Prediction(
         moved, _carried(last.pose, last.covariance, moved, sigma, sigma_yaw), False)
+
+
+def _trace(covariance: Array) -> float:
+    """Sum of the variances of (x, y, yaw)."""
+    return sum(covariance.ravel().tolist()[::4])
 
 
 def _carried(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+import itertools
 import math
 
 from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
@@ -88,10 +89,11 @@ class BandPredictor:
         self._direction = as_complex(line_map.directions[self._lines, :2])
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        # Half width, length, parts (see _GAPS) per metre, the first of them and direction to the
-        # left, by rows.
+        self._powers = self._direction ** _TURNS[:, None]
+        # Half width, half its square, length, parts (see _GAPS) per metre, the first of them and
+        # direction to the left, by rows.
         self._tapes = np.array([
-            self._half_width, self._length, _GAPS / self._length,
+            self._half_width, 0.5 * self._half_width**2, self._length, _GAPS / self._length,
             _GAPS * np.arange(len(self._lines)), -self._direction.imag, self._direction.real])
         distance = np.linspace(0.0, 1.0, _COARSE) * self._length[:, None]
         self._samples = (self._start[:, None] + distance * self._direction[:, None]).ravel()
@@ -112,29 +114,32 @@ class BandPredictor:
         tapes = len(self._lines)
         pixels, seen = self._table.outline(
             (self._samples - complex(pose.x, pose.y)) * _turned_back(pose))
-        curve, seen = pixels.reshape(-1, _COARSE), seen.reshape(-1, _COARSE)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
         # invertible.
-        steps = np.zeros((tapes, _COARSE))
-        np.abs(curve[:, 1:] - curve[:, :-1], out=steps[:, 1:])
-        steps[:, 1:] *= seen[:, 1:] & seen[:, :-1]
+        steps = np.zeros(len(pixels))
+        np.abs(pixels[1:] - pixels[:-1], out=steps[1:])
+        steps[1:] *= seen[1:] & seen[:-1]
+        steps[::_COARSE] = 0.0
         axis = steps.cumsum()
-        begin = axis[::_COARSE]
-        length = np.maximum(axis[_COARSE - 1::_COARSE] - begin - 2.0 * _END, 0.0)
-        count = np.minimum(min(most, _MOST // max(tapes, 1)), length / spacing).astype(int)
+        # Lines are few beside their samples: number by number they cost less than any call.
+        begin, end = axis[::_COARSE].tolist(), axis[_COARSE - 1::_COARSE].tolist()
+        length = [max(b - a - 2.0 * _END, 0.0) for a, b in zip(begin, end)]
+        limit = min(most, _MOST // max(tapes, 1))
+        count = [min(limit, int(each / spacing)) for each in length]
         if lines is not None:
-            count[~np.isin(self._lines, list(lines))] = 0
+            count = [n if k in lines else 0 for k, n in zip(self._lines.tolist(), count)]
         # All groups are equal, so that what is summed over them needs no list of their sizes.
-        shown = max(float(length.dot(count > 0)), spacing)
-        members = max(round(_SHARED_PX * int(count.sum()) / shown), 1)
-        count -= count % members
-        number = np.arange(tapes).repeat(count)
-        first = count.cumsum() - count
-        each = length / np.maximum(count, 1)
-        spacing_px = each.take(number)
-        where = np.arange(0.5, len(number)) * spacing_px + (
-            begin + _END - first * each).take(number)
+        shown = max(sum(each for each, n in zip(length, count) if n), spacing)
+        members = max(round(_SHARED_PX * sum(count) / shown), 1)
+        count = [n - n % members for n in count]
+        apart = [each / max(n, 1) for each, n in zip(length, count)]
+        first = itertools.accumulate(count, initial=0)
+        before = [a + _END - n * each for a, n, each in zip(begin, first, apart)]
+        times = np.array(count, dtype=np.intp)
+        number = np.arange(tapes).repeat(times)
+        spacing_px, offset = np.array([apart, before]).repeat(times, axis=1)
+        where = np.arange(0.5, len(number)) * spacing_px + offset
         distance = np.interp(where, axis + self._slope, self._distance)
         return Places(number, distance, spacing_px, members)
 
@@ -152,19 +157,19 @@ class BandPredictor:
         number, distance = places.number, places.distance
         turn = _turned_back(pose)
         origin = (self._start - complex(pose.x, pose.y)) * turn
-        turns = ((self._direction * turn) ** _TURNS[:, None]).take(number, axis=1)
-        ahead = turns[1]
+        turns = self._powers.take(number, axis=1)
+        ahead = turn * turns[1]
         middle = origin.take(number) + distance * ahead
         if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
         image = self._table.expand(middle)
         # How the pixel goes as the point goes ahead on the line, and to its left.
-        along = _TO_LINE.dot(image.terms * turns)
+        along = (_TO_LINE * turn ** _TURNS).dot(image.terms * turns)
         pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left = along
         speed = np.abs(by_ahead)
         turned, bent = along[2:4] / by_ahead
         tapes = self._tapes.take(number, axis=1)
-        (half, length, gaps_per_metre, first_gap), left = tapes[:4], tapes[4:]
+        (half, half_square, length, gaps_per_metre, first_gap), left = tapes[:5], tapes[5:]
         # The cut across the tape whose image is normal to the curve leans along the line.
         lean = -turned.real
         gain = np.abs(turned.imag) * speed
@@ -173,7 +178,7 @@ class BandPredictor:
         across = 1j * slowness * by_ahead
         bend = slowness * bent.imag
         # The two edges lie unequally far from the midline: a matter of the second order.
-        centre = as_points(pixels + 0.5 * half * half * (
+        centre = as_points(pixels + half_square * (
             (twice_ahead * lean + twice_mixed) * lean + twice_left))
         half_width = half * gain
         gap = self._gap.take(

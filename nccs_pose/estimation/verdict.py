@@ -79,7 +79,7 @@ def objection(
             'image')
     mean, deviation = line_offsets(alignment, len(line_map))
     off = np.abs(mean) > np.maximum(options.largest_misfit, _EVIDENT * deviation)
-    if off.any():
+    if np.count_nonzero(off):
         k = int(np.where(off, np.abs(mean), 0.0).argmax())
         return Objection(
             f'{_name(line_map, k)} lies {abs(mean[k]):.1f} px off: the rig or the map does not '

@@ -33,7 +33,7 @@ def wrap_angle(angle: ArrayLike) -> Array:
     return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-def _wrapped(angle: float) -> float:
+def wrapped(angle: float) -> float:
     """As wrap_angle, for one number."""
     return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
@@ -58,7 +58,7 @@ class Pose2:
             raise GeometryError(f'pose ({x}, {y}, {yaw}) is not finite')
         object.__setattr__(self, 'x', x)
         object.__setattr__(self, 'y', y)
-        object.__setattr__(self, 'yaw', _wrapped(yaw))
+        object.__setattr__(self, 'yaw', wrapped(yaw))
 
     @classmethod
     def from_array(cls, array: Sequence[float] | Array) -> Pose2:
@@ -73,7 +73,7 @@ class Pose2:
     def minus(self, other: Pose2) -> Array:
         """Return (x, y, yaw) less another's as an array (3,), the difference of angles wrapped."""
         return np.array([
-            self.x - other.x, self.y - other.y, _wrapped(self.yaw - other.yaw)])
+            self.x - other.x, self.y - other.y, wrapped(self.yaw - other.yaw)])
 
     @property
     def rotation(self) -> Array:

@@ -46,13 +46,13 @@ def read_pixels(
     centre, across = as_complex(bands.centre), as_complex(bands.across)
     half_band = bands.half_width + margin
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
-    bend = 0.5 * bands.bend
+    bend, length = 0.5 * bands.bend, bands.spacing * across
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
     terms = np.empty((len(bands), 4), np.complex64)
     terms[:, 0] = centre
     terms[:, 1] = half_band * across
-    terms[:, 2] = -1j * bands.spacing * across
-    terms[:, 3] = bend * np.square(bands.spacing) * across
+    terms[:, 2] = -1j * length
+    terms[:, 3] = bend * bands.spacing * length
     pixels = terms.view(np.float32) @ _grid(rows, k)
     np.rint(pixels, out=pixels)
     values = cv2.remap(image, pixels.reshape(len(bands), -1, 2), None, cv2.INTER_NEAREST,
@@ -95,7 +95,7 @@ def profile_products(
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
     is the profile, D = dT/d(delta) and B = dT/d(blur), both times sqrt(2 pi) blur: for shifts and
-    changes of the blur in :func:`unit`.
+    changes of the blur in :func:`unit`; s counts in blurs.
 
     :param pixels: (N, P, 3) BGR.
     :param s: their place across the curve (N, P), px.
@@ -107,7 +107,8 @@ def profile_products(
     n, count = s.shape
     rows = np.empty((8, n, count), np.float32)
     # What is filled last lends its place before: the less memory, the more of it is at hand.
-    rise, place, edges, square = rows[:2], rows[2], rows[4:6], rows[6:8]
+    edges, place, powers = rows[:2], rows[2], rows[4:8]
+    rise, square = powers[:2], powers[2:]
     np.multiply(s, np.float32(1.0 / blur), out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
@@ -117,16 +118,15 @@ def profile_products(
     np.multiply(square, np.float32(-0.0713548), out=rise)
     rise -= np.float32(1.5957692)
     rise *= edges
-    _exponentiate(rise)
+    square *= np.float32(-0.5)
+    # By OpenCV, quicker than numpy's.
+    cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
+    edges *= square
+    np.subtract(edges[1], edges[0], out=rows[3])
     rise += np.float32(1.0)
     np.reciprocal(rise, out=rise)
-    square *= np.float32(-0.5)
-    steep = _exponentiate(square)
-    edges *= steep
     np.subtract(rise[0], rise[1], out=rows[0])
-    np.subtract(steep[1], steep[0], out=rows[1])
-    rows[2] = s
-    np.subtract(edges[1], edges[0], out=rows[3])
+    np.subtract(square[1], square[0], out=rows[1])
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
     less = pixels[0, 0].astype(np.float32)
     np.subtract(pixels.transpose(2, 0, 1), less[:, None, None], out=rows[4:7])
@@ -143,9 +143,3 @@ def unit(blur: float) -> float:
     """What a unit of a template's derivative stands for, px."""
     return math.sqrt(2.0 * math.pi) * blur
 
-
-def _exponentiate(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Exponentials in the place of values of any shape: quicker than numpy's by OpenCV."""
-    flat = values.reshape(1, -1)
-    cv2.exp(flat, flat)
-    return values
