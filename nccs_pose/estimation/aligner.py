@@ -222,10 +222,11 @@ class Aligner:
         if len(bands) < _LEAST_STATIONS:
             return None
         fit, colours = self._fit(image, bands, colours, rough)
-        used, = (fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)).nonzero()
+        felt = fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)
+        used, = felt.nonzero()
         if len(used) < _LEAST_STATIONS:
             return None
-        if not rough and float(bands.spacing.take(used).sum()) < _LEAST_LENGTH:
+        if not rough and bands.spacing.dot(felt) < _LEAST_LENGTH:
             return None
         by_pose, by_attitude = slide.T[:3], slide.T[3:]
         refinement = self._solved(

@@ -130,15 +130,20 @@ def alignment_of(measured: Pass, lines: int) -> Alignment:
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, scale * sigma, label), residual, scale, sigma,
-        float(explained), tuple(there.nonzero()[0].tolist()), _missing(bands, index),
+        float(explained), tuple(there.nonzero()[0].tolist()), _missing(bands, index, label),
         there / np.where(seen > 0, seen, np.nan), misfit, measured.colours, bands)
 
 
-def _missing(bands: Bands, found: NDArray[np.intp]) -> tuple[int, ...]:
-    """Lines that should be seen plainly, of which next to nothing is among the found stations."""
+def _missing(
+    bands: Bands, found: NDArray[np.intp], label: NDArray[np.intp],
+) -> tuple[int, ...]:
+    """Lines that should be seen plainly, of which next to nothing is among the found stations.
+
+    :param label: of these.
+    """
     plain = bands.spacing * (bands.half_width >= 0.5 * _PLAIN_WIDTH)
     seen = np.bincount(bands.label, plain)
-    there = np.bincount(bands.label.take(found), plain.take(found), minlength=len(seen))
+    there = np.bincount(label, plain.take(found), minlength=len(seen))
     return tuple(((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).nonzero()[0].tolist())
 
 

@@ -55,8 +55,8 @@ def as_complex(vectors: Array) -> Complex:
 
 
 def as_points(numbers: Complex) -> Array:
-    """Complex numbers (N,) as vectors (N, 2) again."""
-    return np.ascontiguousarray(numbers).view(np.float64).reshape(-1, 2)
+    """Complex numbers (N,), one after the other in memory, as vectors (N, 2) again."""
+    return numbers.view(np.float64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, eq=False)

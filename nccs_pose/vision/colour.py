@@ -113,7 +113,7 @@ class LineColour:
             return self
         weight = power * good
         return self.taught(
-            height.dot(weight) / weight.sum(),
+            height.dot(weight) / power.dot(good),
             clutter.reshape(9, -1).dot(good).reshape(3, 3) / count, floor)
 
     def taught(self, contrast: Array, clutter: Array, floor: Array) -> LineColour:
@@ -161,5 +161,8 @@ class LineColour:
             return self
         step = min(max(unit * float(height.dot(left)) / total, -_BLUR_STEP), _BLUR_STEP)
         least, most = _BLUR_RANGE
-        return LineColour(
+        sharper = LineColour(
             self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most))
+        # What does not depend on the blur is not worked out again.
+        vars(sharper)['discriminant'] = self.discriminant
+        return sharper

@@ -122,7 +122,7 @@ class _System(NamedTuple):
 
     :ivar power: of T (G,).
     :ivar swept: of T, D, s, B and the channels (columns) what mean and T leave of their products
-        with each other (7 rows), then what they have of T and of 1 (9, 7, G).
+        with each other (7 rows), then what they have of 1 and of T (9, 7, G).
     :ivar slope_power: of s in that (G,), and so of D, ``own_power``.
     :ivar left: covariance of the channels that no template explains (3, 3, G).
     """
@@ -136,12 +136,12 @@ class _System(NamedTuple):
     @property
     def height(self) -> Array:
         """Contrast of each channel (3, G)."""
-        return self.swept[7, 4:]
+        return self.swept[8, 4:]
 
     @property
     def floor(self) -> Array:
         """What each channel is beside the tape (3, G)."""
-        return self.swept[8, 4:]
+        return self.swept[7, 4:]
 
 
 def _eliminated(pooled: Array, size: int) -> _System:
@@ -150,13 +150,14 @@ def _eliminated(pooled: Array, size: int) -> _System:
     :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
     :param size: samples of each group.
     """
-    means = pooled[:, 7] / size
-    products = pooled[:, :7] - means[:, None] * pooled[:, 7]
-    power = np.maximum(products[0, 0], 1e-9)
-    swept = np.empty((9, *products.shape[1:]))
-    rest, shares = swept[:7], np.divide(products[0], power, out=swept[7])
-    np.subtract(products, shares[:, None] * products[0], out=rest)
-    np.subtract(means, shares * means[0], out=swept[8])
+    total, swept = pooled[:, 7], np.empty((9, 7, pooled.shape[2]))
+    rest, means, shares = swept[:7], swept[7], swept[8]
+    np.divide(total, size, out=means)
+    np.subtract(pooled[:, :7], means[:, None] * total, out=rest)
+    power = np.maximum(rest[0, 0], 1e-9)
+    np.divide(rest[0], power, out=shares)
+    # The products and the means alike.
+    swept[:8] -= swept[:8, :1] * shares
     slope_power = np.maximum(rest[2, 2], 1e-9)
     own_power = np.maximum(rest[1, 1], 1e-9)
     crossed, slope, own = rest[1, 2], rest[2, 4:], rest[1, 4:]
@@ -214,8 +215,8 @@ def _shifts(
     shift_power = np.maximum(system.own_power - share * crossed, 1e-9)
     variance *= repeats
     moved = (own - share * slope) / shift_power
-    a = seen[7] - swept[7, 1] * moved
-    told = power / variance
+    beside = seen[7:] - swept[7:, 1] * moved
+    a, told = beside[1], power / variance
     level, certain = _levels(label, a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One group's contrast is noisy where the tape is thin; its neighbours know better.
@@ -223,17 +224,19 @@ def _shifts(
     smooth = np.maximum((a * known + level) / (known + 1.0), 1e-9)
     # What each station's pixels say to D beside the floor and the contrast of its group; the
     # weighted mean over the group is the group's own shift.
-    tilt = believed * slope - share * moved
-    height, base = (seen[7:] - swept[7:, 1] * moved - swept[7:, 2] * tilt).repeat(
-        members, axis=1)
-    said = (weights.dot(by_shift[4:7]) - height * by_shift[0]
-            - tilt.repeat(members) * by_shift[2] - base * by_shift[7])
+    groups = np.empty((5, len(power)))
+    tilt = np.subtract(believed * slope, share * moved, out=groups[2])
+    np.subtract(beside, swept[7:, 2] * tilt, out=groups[:2])
+    groups[3] = smooth
+    np.divide(variance * pooled[1, 1], shift_power, out=groups[4])
+    base, height, tilt, contrast, noise = groups.repeat(members, axis=1)
+    said = (weights.dot(by_shift[4:7]) - height * by_shift[0] - tilt * by_shift[2]
+            - base * by_shift[7])
     own_power = np.maximum(by_shift[1], 1e-9)
-    noise = variance * pooled[1, 1] / (shift_power * np.square(smooth))
+    told_px = own_power * contrast
     return _Seen(
-        ProfileFit(said / (own_power * smooth.repeat(members)),
-                   np.sqrt(noise.repeat(members) / own_power), found.repeat(members)),
-        moved / smooth, seen[7], seen[3])
+        ProfileFit(said / told_px, np.sqrt(noise * own_power) / told_px, found.repeat(members)),
+        moved / smooth, seen[8], seen[3])
 
 
 def median(values: Array) -> float:
