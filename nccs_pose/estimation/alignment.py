@@ -53,7 +53,8 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
-    :ivar misfit: root mean square by which whole stretches of lines lie off, beyond noise, px.
+    :ivar offset: by which each group of neighbours lies off its line (G,), px.
+    :ivar offset_label: line of each group (G,).
     :ivar colours: the colours as this image shows them.
     :ivar bands: all stations that were looked at.
     """
@@ -69,9 +70,15 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
-    misfit: float
+    offset: Array
+    offset_label: NDArray[np.intp]
     colours: tuple[LineColour, ...]
     bands: Bands
+
+    @cached_property
+    def misfit(self) -> float:
+        """Root mean square by which whole stretches of lines lie off, beyond noise, px."""
+        return common_misfit(self.offset, self.offset_label)
 
     @cached_property
     def width(self) -> Array:
@@ -123,15 +130,15 @@ def alignment_of(measured: Pass, lines: int) -> Alignment:
     pixels = (bands.midline + fit.shift[:, None] * bands.across).take(index, axis=0)
     first, members = runs(index // bands.members)
     # Residuals of whole groups, times what noise the group has together.
-    misfit = common_misfit(
-        np.add.reduceat(residual, first) / np.sqrt(
-            members * np.add.reduceat(1.0 / np.square(sigma), first)), label.take(first))
+    offset = np.add.reduceat(residual, first) / np.sqrt(
+        members * np.add.reduceat(1.0 / np.square(sigma), first))
     seen, there = np.bincount(bands.label, minlength=lines), np.bincount(label, minlength=lines)
     return Alignment(
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, scale * sigma, label), residual, scale, sigma,
         float(explained), tuple(there.nonzero()[0].tolist()), _missing(bands, index, label),
-        there / np.where(seen > 0, seen, np.nan), misfit, measured.colours, bands)
+        there / np.where(seen > 0, seen, np.nan), offset, label.take(first), measured.colours,
+        bands)
 
 
 def _missing(

@@ -118,8 +118,8 @@ class BandPredictor:
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
         # invertible.
         steps = np.zeros(len(pixels))
-        np.abs(pixels[1:] - pixels[:-1], out=steps[1:])
-        steps[1:] *= seen[1:] & seen[:-1]
+        after = np.abs(pixels[1:] - pixels[:-1], out=steps[1:])
+        after *= seen[1:] & seen[:-1]
         steps[::_COARSE] = 0.0
         axis = steps.cumsum()
         # Lines are few beside their samples: number by number they cost less than any call.

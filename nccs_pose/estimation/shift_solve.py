@@ -153,9 +153,9 @@ def _prior(
     free, vague = _unknowns(*attitude_sigma)
     information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
-        known = inverse(prior[1])
-        information[:3, :3] += known
-        told[:3] = known.dot(prior[0].minus(start))
+        known, of_pose = inverse(prior[1]), information[:3, :3]
+        of_pose += known
+        known.dot(prior[0].minus(start), out=told[:3])
     return free, information, told
 
 

@@ -73,17 +73,18 @@ def objection(
     if alignment.explained < options.least_explained:
         return Objection(
             f'only {100.0 * alignment.explained:.0f} % of the predicted line pixels are there')
-    if alignment.misfit > options.largest_misfit:
+    most = options.largest_misfit
+    # No stretch lies farther off than one of its groups.
+    if np.abs(alignment.offset).max() > most and alignment.misfit > most:
         return Objection(
             f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not fit the '
             'image')
-    mean, deviation = line_offsets(alignment, len(line_map))
-    off = np.abs(mean) > np.maximum(options.largest_misfit, _EVIDENT * deviation)
-    if np.count_nonzero(off):
-        k = int(np.where(off, np.abs(mean), 0.0).argmax())
+    off = _line_off(alignment, len(line_map), most)
+    if off is not None:
+        k, offset = off
         return Objection(
-            f'{_name(line_map, k)} lies {abs(mean[k]):.1f} px off: the rig or the map does not '
-            'fit the image', line=k)
+            f'{_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not fit '
+            'the image', line=k)
     used = lines_used(alignment)
     scale, size = alignment.scale, alignment.residual_px
     times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
@@ -110,16 +111,37 @@ def is_weak(alignment: Alignment) -> bool:
     return lines_used(alignment) < 3 or (scale > times and size > least)
 
 
+def _line_off(alignment: Alignment, lines: int, most: float) -> tuple[int, float] | None:
+    """The line that as a whole lies farthest off, evidently and by more than so many px.
+
+    :returns: its index in the map and how far it lies off, px.
+    """
+    # Hardly ever does one lie off so far that its scatter has to be known.
+    size = np.abs(_line_means(alignment, lines)[0])
+    if size.max() <= most:
+        return None
+    _, deviation = line_offsets(alignment, lines)
+    size[size <= np.maximum(most, _EVIDENT * deviation)] = 0.0
+    k = int(size.argmax())
+    return (k, float(size[k])) if size[k] > 0.0 else None
+
+
+def _line_means(alignment: Alignment, lines: int) -> tuple[Array, Array]:
+    """Mean offset of each whole line (L,), px, 0 where unused, and its weight."""
+    label, residual, noise = alignment.points.label, alignment.residual, alignment.noise
+    # Offsets are the residuals times the noise, and weigh by one over its square.
+    total = np.maximum(np.bincount(label, 1.0 / np.square(noise), lines), 1e-12)
+    return np.bincount(label, residual / noise, lines) / total, total
+
+
 def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     """Mean offset of each whole line (L,) and its standard deviation, px; 0 where unused.
 
     The deviation comes from the line's own scatter: a line that lies off as a whole must not
     pass for noise.
     """
-    label, residual, noise = alignment.points.label, alignment.residual, alignment.noise
-    # Offsets are the residuals times the noise, and weigh by one over its square.
-    total = np.maximum(np.bincount(label, 1.0 / np.square(noise), lines), 1e-12)
-    mean = np.bincount(label, residual / noise, lines) / total
+    label, residual = alignment.points.label, alignment.residual
+    mean, total = _line_means(alignment, lines)
     scatter = np.bincount(label, np.square(residual), lines) - total * np.square(mean)
     count = np.maximum(np.bincount(label, minlength=lines) - 1, 1)
     return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)

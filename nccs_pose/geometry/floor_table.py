@@ -198,11 +198,11 @@ class FloorTable:
         From the nearest knot on, to second order.
         """
         knots, step = self._nearest(points)
-        terms, back = knots[:6], step.conj()
+        terms, pixels, back = knots[:6], knots[0], step.conj()
         # Half of what the step adds to the first derivatives; the pixel goes by their mean.
         slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
         slopes += added
-        terms[0] += slopes[0] * step + slopes[1] * back
+        pixels += slopes[0] * step + slopes[1] * back
         slopes += added
         return FloorExpansion(terms, knots[7] + knots[8].real * step)
 

@@ -105,9 +105,9 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter.dot(scatter))) / total:
             return self
-        ordered, middle = along.copy(), len(along) // 2
-        ordered.partition(middle)
-        good = along > 0.3 * max(float(ordered[middle]), 0.0)
+        ordered = along.copy()
+        ordered.sort()
+        good = along > 0.3 * max(float(ordered[len(along) // 2]), 0.0)
         count = np.count_nonzero(good)
         if count < 10:
             return self

@@ -43,23 +43,24 @@ def read_pixels(
     """
     # A point of the image is a complex number: (p - c) times the normal's conjugate has the place
     # across for its real part and the one along (backwards) for its imaginary part.
-    centre, across = as_complex(bands.centre), as_complex(bands.across)
+    across = bands.across.view(np.complex128)[:, 0]
     half_band = bands.half_width + margin
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
     bend, length = 0.5 * bands.bend, bands.spacing * across
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
-    terms = np.empty((len(bands), 4), np.complex64)
-    terms[:, 0] = centre
+    terms = np.empty((len(bands), 5), np.complex64)
+    terms[:, 0] = bands.centre.view(np.complex128)[:, 0]
     terms[:, 1] = half_band * across
     terms[:, 2] = -1j * length
     terms[:, 3] = bend * bands.spacing * length
-    pixels = terms.view(np.float32) @ _grid(rows, k)
+    np.conjugate(across, out=terms[:, 4], casting='same_kind')
+    pixels = terms.view(np.float32)[:, :8] @ _grid(rows, k)
     np.rint(pixels, out=pixels)
     values = cv2.remap(image, pixels.reshape(len(bands), -1, 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
     at = pixels.view(np.complex64)
-    at -= centre[:, None]
-    at *= across.conj()[:, None]
+    at -= terms[:, :1]
+    at *= terms[:, 4:]
     s = np.square(at.imag)
     s *= bend.astype(np.float32)[:, None]
     return values, np.subtract(at.real, s, out=s)
@@ -109,21 +110,21 @@ def profile_products(
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(s, np.float32(1.0 / blur), out=place)
+    np.multiply(s, 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
     np.square(edges, out=square)
     # The logistic function of a cubic is the normal distribution to 0.0003.
-    np.multiply(square, np.float32(-0.0713548), out=rise)
-    rise -= np.float32(1.5957692)
+    np.multiply(square, -0.0713548, out=rise)
+    rise -= 1.5957692
     rise *= edges
-    square *= np.float32(-0.5)
+    square *= -0.5
     # By OpenCV, quicker than numpy's.
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
     edges *= square
     np.subtract(edges[1], edges[0], out=rows[3])
-    rise += np.float32(1.0)
+    rise += 1.0
     np.reciprocal(rise, out=rise)
     np.subtract(rise[0], rise[1], out=rows[0])
     np.subtract(square[1], square[0], out=rows[1])

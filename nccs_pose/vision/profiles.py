@@ -151,13 +151,12 @@ def _eliminated(pooled: Array, size: int) -> _System:
     :param size: samples of each group.
     """
     total, swept = pooled[:, 7], np.empty((9, 7, pooled.shape[2]))
-    rest, means, shares = swept[:7], swept[7], swept[8]
+    rest, means, both, shares = swept[:7], swept[7], swept[:8], swept[8]
     np.divide(total, size, out=means)
     np.subtract(pooled[:, :7], means[:, None] * total, out=rest)
     power = np.maximum(rest[0, 0], 1e-9)
     np.divide(rest[0], power, out=shares)
-    # The products and the means alike.
-    swept[:8] -= swept[:8, :1] * shares
+    both -= both[:, :1] * shares
     slope_power = np.maximum(rest[2, 2], 1e-9)
     own_power = np.maximum(rest[1, 1], 1e-9)
     crossed, slope, own = rest[1, 2], rest[2, 4:], rest[1, 4:]
@@ -241,9 +240,9 @@ def _shifts(
 
 def median(values: Array) -> float:
     """The middle one of some values (N,), the upper one of two."""
-    ordered, middle = values.copy(), len(values) // 2
-    ordered.partition(middle)
-    return float(ordered[middle])
+    ordered = values.copy()
+    ordered.sort()
+    return float(ordered[len(values) // 2])
 
 
 def _levels(
