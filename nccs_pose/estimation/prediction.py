@@ -44,11 +44,11 @@ _MOST = 1500
 _LEVEL = np.zeros(3)
 # The terms of an expansion by the direction of a line: by which powers of it they go, and what the
 # pixel, its derivatives ahead on the line and to its left, the second ones (ahead, twice the
-# mixed one, to the left) are of them.
+# mixed one, to the left), and the first one a quarter turn on are of them.
 _TURNS = np.array([0, 1, -1, 2, 0, -2])
 _TO_LINE = np.array([
     [1, 0, 0, 0, 0, 0], [0, 1, 1, 0, 0, 0], [0, 1j, -1j, 0, 0, 0],
-    [0, 0, 0, 1, 2, 1], [0, 0, 0, 2j, 0, -2j], [0, 0, 0, -1, 2, -1]])
+    [0, 0, 0, 1, 2, 1], [0, 0, 0, 2j, 0, -2j], [0, 0, 0, -1, 2, -1], [0, 1j, 1j, 0, 0, 0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ class BandPredictor:
         image = self._table.expand(middle)
         # How the pixel goes as the point goes ahead on the line, and to its left.
         along = (_TO_LINE * turn ** _TURNS).dot(image.terms * turns)
-        pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left = along
+        pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left, beside = along
         speed = np.abs(by_ahead)
         turned, bent = along[2:4] / by_ahead
         tapes = self._tapes.take(number, axis=1)
@@ -175,7 +175,7 @@ class BandPredictor:
         gain = np.abs(turned.imag) * speed
         # One over the speed, negative where the image is reflected.
         slowness = np.copysign(1.0, turned.imag) / speed
-        across = 1j * slowness * by_ahead
+        across = slowness * beside
         bend = slowness * bent.imag
         # The two edges lie unequally far from the midline: a matter of the second order.
         centre = as_points(pixels + half_square * (

@@ -119,7 +119,7 @@ class FloorTable:
         cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
         place: Complex = cells + 1j * cells[:, None]
         inside = 1.0 - np.abs(place) ** 2
-        ends = self._place(np.array([self.reach + 0j])).real + _MARGIN
+        ends = self.reach / self._stretch(np.array(self.reach)) + _MARGIN
         known = (np.abs(place) < ends) & (inside > 0.0)
         inside[~known] = np.nan
         # What is not known is not a number, nor are derivatives next to it.
@@ -183,10 +183,10 @@ class FloorTable:
         """
         at = as_complex(points)
         knots, step = self._nearest(at)
-        steeper = knots[8].real
+        steeper = knots[:, 8].real
         # The ray meets the floor a little further on, but comes from the same place.
         share = rise / np.maximum(1.0 - rise * steeper, 0.5)
-        return as_points(at + share * (knots[7] + steeper * step))
+        return as_points(at + share * (knots[:, 7] + steeper * step))
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
@@ -197,7 +197,8 @@ class FloorTable:
 
         From the nearest knot on, to second order.
         """
-        knots, step = self._nearest(points)
+        nearest, step = self._nearest(points)
+        knots = np.ascontiguousarray(nearest.T)
         terms, pixels, back = knots[:6], knots[0], step.conj()
         # Half of what the step adds to the first derivatives; the pixel goes by their mean.
         slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
@@ -213,21 +214,23 @@ class FloorTable:
             image shows the floor about there (N,), to a few px.
         """
         knots, step = self._nearest(points)
-        pixels = knots[0] + knots[1] * step + knots[2] * step.conj()
-        return pixels, np.asarray(knots[8].imag > 0.0)
+        pixels = knots[:, 0] + knots[:, 1] * step + knots[:, 2] * step.conj()
+        return pixels, np.asarray(knots[:, 8].imag > 0.0)
 
     def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
-        """The nearest knots to points (9, N), see :meth:`_forward`, and the way from them (N,)."""
+        """The nearest knots to points (N, 9), see :meth:`_forward`, and the way from them (N,)."""
         offset = points - self._foot
-        place = as_points(np.rint(_CELLS * self._place(offset)))
-        at = place.dot(_KNOTS_APART) + _MIDDLE_KNOT
-        some = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
-        knots = np.ascontiguousarray(some.T)
-        return knots, offset - knots[6]
+        place = as_points(offset * (_CELLS / self._stretch(np.abs(offset))))
+        at = np.rint(place).dot(_KNOTS_APART) + _MIDDLE_KNOT
+        knots = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
+        return knots, offset - knots[:, 6]
 
-    def _place(self, offset: Complex) -> Complex:
-        """Where the stereographic plane has points of the floor: infinity is the unit circle."""
-        return offset / (self.height + np.hypot(np.abs(offset), self.height))
+    def _stretch(self, distance: Array) -> Array:
+        """How many metres of the floor, so far from the foot, one of the stereographic plane is.
+
+        Infinity comes to lie on its unit circle.
+        """
+        return self.height + np.hypot(distance, self.height)
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""
