@@ -183,6 +183,18 @@ def test_a_blurred_bend_is_measured_where_it_is(
     assert abs(fit.shift.mean()) < 0.15 * 0.5 * blur**2 / radius
 
 
+@pytest.mark.parametrize('half_width', [1.5, 4.0])
+@pytest.mark.parametrize('shift', [0.42, -0.5])
+def test_edges_softer_than_their_template_are_not_learned_but_reckoned_with(
+        half_width: float, shift: float) -> None:
+    # A template that lies a third of a pixel beside its tape, or more, learns nothing.
+    image, known = _tape(half_width, 0.13, blur=2.4), LineColour.nominal('green', 1.9)
+    fit, learned = fit_profiles(image, _straight_bands(half_width, 0.13, shift), known)
+    assert learned.blur == known.blur
+    # By itself it takes a shift for a tenth to a sixth too little, and its noise as well.
+    assert float(np.median(fit.shift)) == pytest.approx(shift, rel=0.07)
+
+
 @pytest.mark.parametrize('blur', [0.5, 1.0, 1.8])
 @pytest.mark.parametrize('half_width', [1.5, 4.0])
 def test_the_blur_of_the_edges_is_learned(blur: float, half_width: float) -> None:

@@ -43,7 +43,7 @@ def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -
     Few of them can be told from noise; exp(2 (c_1 + c_2)) is the same for small ones and stays
     positive. For large ones it is more: where neighbours have much in common (floors with texture,
     coarse JPEG), whole lines have too, which the pose takes for its own so that no residual shows
-    it. On simulated images of all kinds squared errors of poses were what it says, to a sixth.
+    it. On simulated images of all kinds squared errors of poses were what it says, to a seventh.
 
     Errors weigh what they do in the fit. A near tape tells most of a pose, and compared with the
     noise told it may err more than a far one (coarse JPEG, whose far tapes are all template) or

@@ -52,7 +52,8 @@ _MOST_ALONG = 40
 _CONTRAST_SPREAD = 0.2
 # Residuals this much above the usual are no chance any more.
 _CHANCE = 2.5
-# The blur is learned from bands that lie this well on their tapes, px.
+# The blur is learned from bands that lie this well on their tapes, px; where it is above one
+# pixel it is seen, but not learned, from such as lie this many blurs off.
 _SHARP_PX = 0.3
 # A line whose contrast is this many standard deviations above nothing is there.
 FOUND = 6.0
@@ -106,11 +107,18 @@ def fit_profiles(
         pooled, by_shift, system, colour.discriminant, repeats, bands.label[::bands.members],
         half_width)
     step = unit(blur)
-    # A template beside its tape would take the misfit for blur.
-    if not rough and step * median(np.abs(shared)) < _SHARP_PX:
-        colour = colour.sharpen(height, softness, system.swept[3, 3], step)
+    seen = colour
+    if not rough:
+        misfit = step * median(np.abs(shared))
+        # A template beside its tape would take the misfit for blur.
+        if misfit < _SHARP_PX * max(1.0, blur):
+            seen = colour.sharpen(height, softness, system.swept[3, 3], step)
+        # What lies no better is smeared by its noise. Edges as soft move a template as told below,
+        # but one as soft as they would be noisier.
+        if misfit < _SHARP_PX:
+            colour = seen
     # An edge moves a template softer than itself by more than the template thinks.
-    gain = step * math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
+    gain = step * math.sqrt(0.5 * (1.0 + (seen.blur / blur) ** 2))
     # Blur draws a bent edge towards the inside of the bend.
     drawn = 0.5 * colour.blur**2 * bands.bend
     return ProfileFit(
