@@ -104,7 +104,7 @@ class Ledger:
         # Twins of what holds that are not laid on the image themselves.
         self._equal: list[Pose2] = []
         self._left = list(left)
-        self._beaten: list[FittedCandidate] = []
+        self._passed_over: list[FittedCandidate] = []
         self._others = others
 
     def knows(self, pose: Pose2) -> bool:
@@ -142,8 +142,8 @@ class Ledger:
         self._left.append(strips)
 
     def pass_over(self, strips: FittedCandidate) -> None:
-        """Leave a candidate that the best pose beats; see :meth:`beats`."""
-        self._beaten.append(strips)
+        """Leave a candidate that is no rival of the best pose that holds."""
+        self._passed_over.append(strips)
 
     def rule_out(self, strips: FittedCandidate, against: Objection) -> None:
         """Refuse a candidate by its strips alone, unless something is hidden."""
@@ -202,7 +202,7 @@ class Ledger:
         left_open += self._unlaid([c for c in self._left if c.score >= least], known, self.best)
         # More of the lines of what explains the same strips may be there than they show.
         rest = self._unlaid(
-            [c for c in (*self._left, *self._beaten)
+            [c for c in (*self._left, *self._passed_over)
              if c.claimed > self.best.claimed - AS_MUCH],
             Poses.of([*poses, *self._laid, *(c.pose for c in left_open)]), self.best)
         return Sifted(

@@ -125,13 +125,16 @@ class Sifter:
         candidates, told = case.sight.candidates, case.told
         if told is not None and len(candidates) > _TRIED:
             candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
-        worth = [c.score >= _WORTH_TRYING * case.sight.promise
-                 or (told is not None and told.holds(c.pose)) for c in candidates[:_TRIED]]
-        ledger = Ledger(self._symmetries, told, self._options.ambiguity_ratio, (
-            *(c for c, good in zip(candidates, worth) if not good), *candidates[_TRIED:]),
+        ledger = Ledger(
+            self._symmetries, told, self._options.ambiguity_ratio, candidates[_TRIED:],
             case.sight.others)
         starts = deque(_Start(h.pose, self._options.band) for h in hypotheses)
-        starts += (_Start.of(c) for c, good in zip(candidates, worth) if good)
+        for c in candidates[:_TRIED]:
+            if c.score >= _WORTH_TRYING * case.sight.promise or (
+                    told is not None and told.holds(c.pose)):
+                starts.append(_Start.of(c))
+            else:
+                ledger.pass_over(c)
         undecided, in_vain = False, 0
         while starts:
             start = starts.popleft()
