@@ -197,17 +197,19 @@ class Ledger:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
         poses = [f.alignment.pose for f in held]
         left_open = self._open(poses, self.best)
-        known = Poses.of([*poses, *self._laid])
-        least = self._ratio * self.best.by_strips
+        known, least = [*poses, *self._laid], self._ratio * self.best.by_strips
         left_open += self._unlaid([c for c in self._left if c.score >= least], known, self.best)
         # More of the lines of what explains the same strips may be there than they show.
         rest = self._unlaid(
             [c for c in (*self._left, *self._passed_over)
              if c.claimed > self.best.claimed - AS_MUCH],
-            Poses.of([*poses, *self._laid, *(c.pose for c in left_open)]), self.best)
+            [*known, *(c.pose for c in left_open)], self.best)
+        others = self._others
+        if len(others.place) > 0:
+            others = others[unlike(others, Poses.of(known))]
         return Sifted(
-            held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score),
-            rest, self._others[unlike(self._others, known)])
+            held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest,
+            others)
 
     def _twins(self, pose: Pose2) -> list[Pose2]:
         return [s @ pose for s in self._symmetries]
@@ -239,13 +241,13 @@ class Ledger:
         return found
 
     def _unlaid(
-        self, left: list[FittedCandidate], known: Poses, best: Found,
+        self, left: list[FittedCandidate], known: list[Pose2], best: Found,
     ) -> list[Candidate]:
         """Candidates that were not laid on the image, nor their likes."""
         if not left:
             return []
         # They differ among themselves.
-        new = unlike(Poses.of([strips.pose for strips in left]), known)
+        new = unlike(Poses.of([strips.pose for strips in left]), Poses.of(known))
         return [
             Candidate(strips.pose, min(strips.score / best.by_strips, 1.0) * best.score)
             for strips, differs in zip(left, new.tolist()) if differs]
