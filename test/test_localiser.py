@@ -516,6 +516,24 @@ def _tilted(scene: Scene, roll: float, pitch: float) -> Scene:
     return replace(scene, rig=replace(rig, T_base_mirror=tilt @ rig.T_base_mirror))
 
 
+@pytest.mark.parametrize(('quality', 'state'), [(95, State.TRACKING), (30, State.SEARCHING)])
+def test_on_a_coarse_image_a_first_pose_shows_all_lines_that_should_be_in_view(
+    quality: int, state: State,
+) -> None:
+    """Three of four tapes are there. Only a sharp image shows for certain which three."""
+    scene = arena_scene(640)
+    shown = LineMap(tuple(line for line in scene.line_map if line.name != 'south'))
+    room = replace(
+        scene, line_map=shown, sensor=replace(scene.sensor, jpeg_quality=quality))
+    localiser = Localiser(scene.rig, scene.line_map)
+    rng = np.random.default_rng([5, 13])
+    pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.5, 0.5, np.pi))
+    estimate = localiser.process(0, render(room, pose, rng))
+    assert estimate.state is state, estimate.reason
+    if quality == 30:
+        assert 'others that should be in view are not there' in estimate.reason
+
+
 def test_roll_and_pitch_are_estimated_where_the_floor_is_not_flat() -> None:
     rng = np.random.default_rng(3)
     held: list[float] = []

@@ -53,6 +53,9 @@ _PLAINLY_ALL = 0.9
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
+_INCOMPLETE = Objection(
+    'its lines lie badly on the image, and others that should be in view are not there',
+    hidden=True)
 
 
 @dataclass(frozen=True)
@@ -255,8 +258,9 @@ class Sifter:
         """A verdict, unless the strips speak as much for another pose, and the image for neither.
 
         An image so coarse that lines lie badly on it is no verdict on another pose: the right one
-        may not be laid on it at all, and the next may be. Where it decides nothing there is no
-        doubt.
+        may not be laid on it at all, and the next may be. Nor need it be among the candidates,
+        since strips lie askew on such an image: a pose has to show all the lines that should be in
+        view. Where it decides nothing there is no doubt.
         """
         if isinstance(found, Objection) or expected:
             return found
@@ -264,6 +268,8 @@ class Sifter:
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
         if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
             return found
+        if alignment.missing:
+            return _INCOMPLETE
         if case.told is None and self._has_many_equals(found, candidates):
             return found
         least = self._options.ambiguity_ratio * found.by_strips
