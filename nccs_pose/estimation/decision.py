@@ -58,7 +58,7 @@ def the_one_expected(
 
 def left_open(
     hypotheses: Sequence[Hypothesis], held: Sequence[Found], sifted: Sifted,
-) -> tuple[tuple[Hypothesis, ...], list[Hypothesis]]:
+) -> tuple[tuple[Hypothesis, ...], list[Candidate]]:
     """The poses among which an image has not decided, and the next one may.
 
     :param hypotheses: those that were open before it.
@@ -75,9 +75,10 @@ def left_open(
     carried_on = (best, *others[:_CARRIED - 1])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-    more = others[_CARRIED - 1:] + [Hypothesis(c.pose, (before * c.score,)) for c in sifted.rest]
+    more = [Candidate(h.pose, h.mean) for h in others[_CARRIED - 1:]]
+    more += (Candidate(c.pose, before * c.score) for c in sifted.rest)
     if len(sifted.others.place) > 0:
         # They show no more than the least of what was looked at closely, for all that is known.
-        least = min((*others, *more), key=lambda h: h.mean, default=best).scores
-        more += (Hypothesis(pose, least) for pose in sifted.others.listed())
+        least = min(best.mean, *(h.mean for h in others), *(c.score for c in more))
+        more += (Candidate(pose, least) for pose in sifted.others.listed())
     return carried_on, more

@@ -290,7 +290,7 @@ class Localiser:
             quality, watch.times)
 
     def _undecided(
-        self, stamp_ns: int, held: list[Found], more: list[Hypothesis], watch: Stopwatch,
+        self, stamp_ns: int, held: list[Found], more: list[Candidate], watch: Stopwatch,
     ) -> Estimate:
         """Say which poses may be right, and give none of them.
 
@@ -298,7 +298,7 @@ class Localiser:
         """
         hypotheses = self._open
         poses = tuple(sorted(
-            (Candidate(h.pose, h.mean) for h in (*hypotheses, *more)), key=lambda c: -c.score))
+            (*(Candidate(h.pose, h.mean) for h in hypotheses), *more), key=lambda c: -c.score))
         ratio = ambiguity(hypotheses)
         quality = _quality(held[0], ratio)
         if ratio > self.options.ambiguity_ratio:
