@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -61,26 +62,34 @@ class FittedCandidate(Candidate):
     misfit: float = 0.0
 
 
+class Candidates(NamedTuple):
+    """Poses that explain strips.
+
+    :ivar fitted: those that were looked at closely, best first.
+    :ivar others: that leave no strip unexplained, but were not looked at any closer: a map may
+        have many hundreds of places alike.
+    """
+
+    fitted: tuple[FittedCandidate, ...]
+    others: Poses
+
+
 class Associator:
     """Finds and scores poses by the strips of an image, on one rig and map.
 
     A pose's score is the harmonic mean of two fractions: of the strips' pixels that lie on map
     lines, and of the map lines in view that strips lie on.
-
-    :ivar others: poses that leave no strip unexplained, but were not looked at any closer, for
-        the candidates that were asked for last: where a map has many hundreds of places alike.
     """
 
     def __init__(self, line_map: LineMap, table: FloorTable) -> None:
         lines = FloorLines(line_map)
         self._place = Place(lines, NearestLines(lines), FloorScale(table))
         self._last: StripScorer | None = None
-        self.others = _NONE
 
     def candidates(
         self, segments: tuple[FloorSegment, ...], told: Told | None = None,
-    ) -> tuple[FittedCandidate, ...]:
-        """Poses that explain strips, best first; none where fewer than two strips cross.
+    ) -> Candidates:
+        """Poses that explain strips; none where fewer than two strips cross.
 
         The best few are laid on the strips by least squares; where a map has many places alike
         the others follow as they were guessed, with what they score there.
@@ -88,22 +97,22 @@ class Associator:
         :param told: where the robot is by something else; poses there are not left out for others
             that explain as much.
         """
-        self.others = _NONE
         if len(segments) < 2:
-            return ()
+            return Candidates((), _NONE)
         scorer = self._scorer(segments)
         poses = Poses(*poses_of_pairs(scorer.strips, self._place.lines, _PAIRS))
         if len(poses.place) == 0:
-            return ()
+            return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []
+        others = _NONE
         if len(poses.place) > _REFINED:
-            poses, guessed, self.others = _promising(scorer, poses, told)
+            poses, guessed, others = _promising(scorer, poses, told)
         poses, claimed, misfit = scorer.refined(poses)
         score = _harmonic(claimed, scorer.explained(poses))
         found = distinct(poses, score)
         refined = [FittedCandidate(*of) for of in zip(
             poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
-        return tuple(sorted((*refined, *guessed), key=lambda c: -c.score))
+        return Candidates(tuple(sorted((*refined, *guessed), key=lambda c: -c.score)), others)
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
         """The score that a pose would have among the candidates, and the strips' part in it.

@@ -90,7 +90,7 @@ class Follower:
             return Refused(against, alignment)
         here, claimed = self._searcher.score(alignment.pose, segments)
         # No score exceeds 1.
-        elsewhere = self._searcher.candidates(segments) if here + _BETTER < 1.0 else ()
+        elsewhere = self._searcher.candidates(segments).fitted if here + _BETTER < 1.0 else ()
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):

@@ -20,10 +20,9 @@ from collections.abc import Callable
 from itertools import permutations
 import math
 
-from nccs_pose.estimation.association import Associator, FittedCandidate
+from nccs_pose.estimation.association import Associator, Candidates
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
-from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_table import FloorTable
@@ -167,16 +166,9 @@ class Searcher:
                 blobs, self._floor, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(
-        self, segments: Strips, told: Told | None = None,
-    ) -> tuple[FittedCandidate, ...]:
-        """Poses that explain the strips, best first; of too many those where it is told."""
+    def candidates(self, segments: Strips, told: Told | None = None) -> Candidates:
+        """Poses that explain the strips; of too many those where it is told."""
         return self._associator.candidates(segments, told)
-
-    @property
-    def others(self) -> Poses:
-        """Poses that leave no strip unexplained, besides the candidates asked for last."""
-        return self._associator.others
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

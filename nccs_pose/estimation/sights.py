@@ -100,8 +100,7 @@ def sights(
         if best is not None and segments is best.segments:
             continue
         lap('detect')
-        sight = Sight(
-            image, segments, searcher.candidates(segments, told), searcher.others, shown)
+        sight = Sight(image, segments, *searcher.candidates(segments, told), shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
