@@ -33,7 +33,8 @@ from nccs_pose.estimation.floor_points import (
     principal_lines,
 )
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.segment import Segmentation, upper_median
+from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.segment import Segmentation
 import numpy as np
 from numpy.typing import NDArray
 

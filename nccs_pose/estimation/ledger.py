@@ -29,8 +29,8 @@ from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 
-# A pose that leaves more of the strips unexplained than another by this much is no rival of it: of
-# wrong poses that such an image seemed to show the right one explained as much or more.
+# A pose that leaves more of the strips unexplained than another by this much is no rival of it:
+# where a coarse image seemed to show a wrong pose, the right one explained as much or more.
 AS_MUCH = 0.05
 
 
@@ -53,7 +53,7 @@ class Sifted:
         laid on it, or that it cannot tell from another; their scores are no higher than its.
     :ivar rest: poses that explain the strips as well, but of which these show fewer lines; they
         were not laid on it either.
-    :ivar others: poses of which the strips show all that they show of these, and no more is known.
+    :ivar others: more poses that leave no strip unexplained, which were not looked at closely.
     """
 
     held: list[Found]

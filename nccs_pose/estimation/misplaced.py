@@ -29,8 +29,9 @@ from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.profile_search import contrast_across
-from nccs_pose.vision.profiles import fit_profiles, median
+from nccs_pose.vision.profiles import fit_profiles
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,7 +100,7 @@ def placement(
     """
     if len(bands) < _LEAST_STATIONS:
         return Placement()
-    width = 2.0 * median(bands.half_width)
+    width = 2.0 * upper_median(bands.half_width)
     fit, _ = fit_profiles(image, bands, colour)
     found = int(fit.found.sum())
     mean, deviation = _mean_shift(
@@ -150,7 +151,7 @@ def _strongest(
 
     :param scale: of the image across the line (N,), px per metre.
     """
-    usual = median(scale)
+    usual = upper_median(scale)
     farthest = min(_NEAR, reach / usual)
     steps = int(np.ceil(farthest * usual / _STEP))
     parallel = farthest / max(steps, 1) * np.arange(-steps, steps + 1.0)

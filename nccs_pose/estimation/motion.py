@@ -88,7 +88,7 @@ class Prediction:
         """
         prior = self.covariance
         gain = solved.dot(inverse(prior))
-        multiple = max(1.0, _trace(covariance) / _trace(solved))
+        multiple = max(1.0, float(covariance.trace() / solved.trace()))
         narrowed = covariance - gain.dot(multiple * prior - self.carried).dot(gain.T)
         return covariance if inverse_3x3(narrowed) is None else narrowed
 
@@ -168,11 +168,6 @@ def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction 
     sigma, sigma_yaw = (0.5 * a * blind * (blind + past) for a in _ACCELERATION)
     return Prediction(
         moved, _carried(last.pose, last.covariance, moved, sigma, sigma_yaw), False)
-
-
-def _trace(covariance: Array) -> float:
-    """Sum of the variances of (x, y, yaw)."""
-    return sum(covariance.ravel().tolist()[::4])
 
 
 def _carried(

@@ -28,7 +28,7 @@ from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import definite_solution, inverse
 from nccs_pose.vision.bands import runs
-from nccs_pose.vision.profiles import median
+from nccs_pose.vision.median import upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -153,9 +153,9 @@ def _prior(
     free, vague = _unknowns(*attitude_sigma)
     information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
-        known, of_pose = inverse(prior[1]), information[:3, :3]
-        of_pose += known
-        known.dot(prior[0].minus(start), out=told[:3])
+        known = inverse(prior[1])
+        information[:3, :3] += known
+        told[:3] = known.dot(prior[0].minus(start))
     return free, information, told
 
 
@@ -175,4 +175,4 @@ def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
 
 def _robust_variance(square: Array) -> float:
     """Of the bulk of whitened residuals by their squares (N,), never below the noise told."""
-    return max(1.0, 1.4826**2 * median(square))
+    return max(1.0, 1.4826**2 * upper_median(square))

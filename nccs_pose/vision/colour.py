@@ -23,6 +23,7 @@ import math
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.small_matrices import solution
+from nccs_pose.vision.median import upper_median
 import numpy as np
 
 # Signs of the contrast (tape minus floor) in B, G, R of each class that a map may name.
@@ -105,9 +106,7 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter.dot(scatter))) / total:
             return self
-        ordered = along.copy()
-        ordered.sort()
-        good = along > 0.3 * max(float(ordered[len(along) // 2]), 0.0)
+        good = along > 0.3 * max(upper_median(along), 0.0)
         count = np.count_nonzero(good)
         if count < 10:
             return self

@@ -23,7 +23,8 @@ from __future__ import annotations
 import math
 
 import cv2
-from nccs_pose.vision.segment import Mask, upper_median
+from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.segment import Mask
 import numpy as np
 from numpy.typing import NDArray
 

@@ -31,6 +31,7 @@ from typing import NamedTuple
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.profile_products import profile_products, read_pixels, unit
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def fit_profiles(
     step = unit(blur)
     seen = colour
     if not rough:
-        misfit = step * median(np.abs(shared))
+        misfit = step * upper_median(np.abs(shared))
         # A template beside its tape would take the misfit for blur.
         if misfit < _SHARP_PX * max(1.0, blur):
             seen = colour.sharpen(height, softness, system.swept[3, 3], step)
@@ -210,7 +211,7 @@ def _shifts(
     own, slope = seen[1], seen[2]
     squares = (weights[:, None] * weights).ravel()
     variance = squares.dot(system.left.reshape(9, -1))
-    usual = max(median(variance), 1e-12)
+    usual = max(upper_median(variance), 1e-12)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
     # A slope of the floor costs a wide tape much of what it tells. How far the slopes of all
@@ -244,13 +245,6 @@ def _shifts(
     return _Seen(
         ProfileFit(said / told_px, np.sqrt(noise * own_power) / told_px, found.repeat(members)),
         moved / smooth, seen[8], seen[3])
-
-
-def median(values: Array) -> float:
-    """The middle one of some values (N,), the upper one of two."""
-    ordered = values.copy()
-    ordered.sort()
-    return float(ordered[len(values) // 2])
 
 
 def _levels(

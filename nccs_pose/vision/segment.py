@@ -17,12 +17,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.colour import CONTRASTS
+from nccs_pose.vision.median import upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,12 +84,6 @@ def chromatic_mask(
     :param window: width of the surroundings, px.
     """
     return raised_mask(contrast_of(image, colour), brightness(image), gate, least, window)
-
-
-def upper_median(values: NDArray[Any]) -> float:
-    """The middle one of values of any shape, the upper of two."""
-    middle = values.size // 2
-    return float(np.partition(values.ravel(), middle)[middle])
 
 
 def brightness(image: NDArray[np.uint8]) -> float:
