@@ -49,3 +49,19 @@ def test_an_image_is_frozen_only_if_the_robot_moved_and_no_pixel_changed(height:
     with pytest.raises(FrameRefusedError) as refused:
         _admission(height, 0.1).admit(100, _image(height, 0))
     assert refused.value.cause == 'frozen_image'
+
+
+def test_a_camera_is_frozen_however_slowly_the_robot_moves_and_until_it_shows_another_image() -> None:
+    odometry, still, other = Odometry(), _image(48, 0), _image(48, 1)
+    admission = Admission(PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0), odometry, 1.0)
+    frozen = []
+    # More samples than are kept, ten of them an image, in which it moves 3 mm.
+    for k in range(20_000):
+        odometry.add(k * 10_000_000, Pose2(0.0003 * k, 0.0, 0.0))
+        if k % 10 == 0 and k > 0:
+            try:
+                admission.admit(k * 10_000_000, still)
+            except FrameRefusedError as error:
+                frozen.append(error.cause)
+    assert frozen == 1997 * ['frozen_image']
+    assert admission.admit(200_000_000_000, other)

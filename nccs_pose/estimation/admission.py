@@ -45,6 +45,9 @@ class Admission:
         """Take the next image whatever its stamp."""
         self._last_stamp: int | None = None
         self._last_content = b''
+        # Stamp of the first image with this content, and whether the robot has moved since.
+        self._same_since = 0
+        self._frozen = False
 
     def admit(self, stamp_ns: int, image: NDArray[np.uint8]) -> bool:
         """Let an image in; False where its clock starts anew and all history is void.
@@ -71,16 +74,18 @@ class Admission:
             raise FrameRefusedError('duplicate_stamp', f'stamp {stamp_ns} ns was there before')
         apart = max(len(image) // _ROWS, 1)
         content = image[apart // 2::apart].tobytes()
-        if continues and content == self._last_content and self._moved_since(last, stamp_ns):
+        same = continues and content == self._last_content
+        self._frozen = same and (self._frozen or self._moved_since(self._same_since, stamp_ns))
+        if self._frozen:
             raise FrameRefusedError(
                 'frozen_image', 'the image has not changed by a bit although the robot has moved')
+        if not same or self._odometry.at(self._same_since) is None:
+            self._same_since = stamp_ns
         self._last_content = content
         self._last_stamp = stamp_ns
         return continues
 
-    def _moved_since(self, before_ns: int | None, after_ns: int) -> bool:
-        if before_ns is None:
-            return False
+    def _moved_since(self, before_ns: int, after_ns: int) -> bool:
         before, after = self._odometry.at(before_ns), self._odometry.at(after_ns)
         if before is None or after is None:
             return False
