@@ -51,7 +51,7 @@ def test_an_image_is_frozen_only_if_the_robot_moved_and_no_pixel_changed(height:
     assert refused.value.cause == 'frozen_image'
 
 
-def test_a_camera_is_frozen_however_slowly_the_robot_moves_and_until_it_shows_another_image() -> None:
+def test_a_frozen_camera_is_found_on_a_slow_robot_and_until_its_image_changes() -> None:
     odometry, still, other = Odometry(), _image(48, 0), _image(48, 1)
     admission = Admission(PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0), odometry, 1.0)
     frozen = []

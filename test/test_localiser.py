@@ -22,6 +22,7 @@ import itertools
 import math
 from typing import Any
 
+from nccs_pose.errors import FrameRefusedError
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.estimate import Estimate, State
@@ -405,6 +406,30 @@ def test_odometry_bridges_darkness_for_a_while_and_no_longer() -> None:
     back = drive.go()
     assert back.state is State.TRACKING
     assert drive.right(back)
+
+
+@pytest.mark.parametrize('odometry', [Pose2(7.0, -3.0, 1.0), Pose2(5.0, -3.0, -2.0)])
+def test_no_pose_is_carried_across_another_start_of_odometry(odometry: Pose2) -> None:
+    drive = Drive(SCENE, Pose2(-0.5, 0.1, 0.3))
+    for _ in range(3):
+        drive.go()
+    drive.odometry = odometry
+    with pytest.raises(FrameRefusedError, match='odometry begins anew') as refused:
+        drive.localiser.add_odometry(drive.stamp + PERIOD_NS // 2, odometry)
+    assert refused.value.cause == 'odom_jump'
+    assert drive.go(change=_black).state is State.LOST
+    assert drive.right(drive.go())
+    assert drive.go(Pose2(0.05, 0.0, 0.0), change=_black).state is State.COASTING
+
+
+def test_a_stamp_from_the_future_ends_odometry_for_a_moment_only() -> None:
+    drive = Drive(SCENE, Pose2(-0.5, 0.1, 0.3))
+    drive.go()
+    drive.localiser.add_odometry(drive.stamp + 10**12, drive.odometry)
+    with pytest.raises(FrameRefusedError, match='jumped back'):
+        drive.localiser.add_odometry(drive.stamp + PERIOD_NS // 2, drive.odometry)
+    drive.go()
+    assert drive.go(Pose2(0.05, 0.0, 0.0), change=_black).state is State.COASTING
 
 
 def test_a_tracked_pose_that_explains_the_image_is_kept() -> None:

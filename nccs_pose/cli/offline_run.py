@@ -38,7 +38,7 @@ class Answering(Protocol):
         """Answer an image; may refuse it with one of the project's errors."""
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
-        """Take notice of the wheels."""
+        """Take notice of the wheels; may refuse a sample with a FrameRefusedError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def run_events(
             try:
                 localiser.add_odometry(event.stamp_ns, event.pose)
             except FrameRefusedError:
-                continue  # a repeated or disordered sample says nothing new
+                continue  # odometry began anew
         elif isinstance(event, StampedImage):
             record, image = _run_image(localiser, event, len(records))
             records.append(record)

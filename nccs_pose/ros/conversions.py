@@ -38,6 +38,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 IMMOVABLE_VARIANCE = 1e-6
 """Variance of z, roll and pitch, which a planar robot cannot change: m^2, rad^2."""
+FARTHEST = 1e8
+"""Metres: further from its origin no frame of the earth is, and sums of squares overflow."""
 PLANAR = (0, 1, 5)
 """Rows of x, y and yaw in a 6 x 6 covariance (x, y, z, roll, pitch, yaw)."""
 
@@ -83,8 +85,8 @@ def image_message(stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> Ima
 def pose_to_planar(pose: Pose, what: str) -> Pose2:
     """The planar part of a pose.
 
-    :raises FrameRefusedError: cause `<what>_pose`, if a number is not finite or the quaternion
-        is none.
+    :raises FrameRefusedError: cause `<what>_pose`, if a number is not finite or beyond the earth,
+        or the quaternion is none.
     """
     p, q = pose.position, pose.orientation
     values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
@@ -92,6 +94,10 @@ def pose_to_planar(pose: Pose, what: str) -> Pose2:
         raise FrameRefusedError(
             f'{what}_pose', f'{what}: position ({p.x}, {p.y}, {p.z}), orientation '
             f'({q.x}, {q.y}, {q.z}, {q.w}): every number must be finite')
+    if max(abs(p.x), abs(p.y)) > FARTHEST:
+        raise FrameRefusedError(
+            f'{what}_pose', f'{what}: position ({p.x:.3g}, {p.y:.3g}) is further than '
+            f'{FARTHEST:g} m from the origin')
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not 0.99 < norm < 1.01:
         raise FrameRefusedError(

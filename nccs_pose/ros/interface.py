@@ -115,8 +115,10 @@ CAUSES = (
     ('`camera_info`', 'a camera_info that contradicts the rig'),
     ('`undecodable`', 'bytes that are no message of the topic (of images the middleware hands on '
      'none: they count as frames_dropped_busy)'),
-    ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite, or '
-     'no rotation'),
+    ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite or '
+     'beyond 1e8 m, or no rotation'),
+    ('`odom_jump`', 'odometry that leaps further than wheels roll (10 m/s, 20 rad/s), or back in '
+     'time by more than `clock_jump`: it begins anew, and carries no pose across'),
     ('`initialpose_frame`, `initialpose_pose`, `initialpose_covariance`',
      'an initial pose in another frame; not finite or no rotation; whose covariance is none'),
     ('`tf_missing`, `tf_pose`', 'an estimate whose odometry transform did not come within 1 s; a '

@@ -63,8 +63,10 @@ class NodeOptions:
             'rig, as a fraction of the focal length.')
     set_initial_pose: bool = option(
         False, doc='Start from initial_pose_* instead of from nothing.')
-    initial_pose_x: float = option(0.0, unit='m', doc='Initial pose in the map frame.')
-    initial_pose_y: float = option(0.0, unit='m', doc='Initial pose in the map frame.')
+    initial_pose_x: float = option(
+        0.0, unit='m', low=-1e8, high=1e8, doc='Initial pose in the map frame.')
+    initial_pose_y: float = option(
+        0.0, unit='m', low=-1e8, high=1e8, doc='Initial pose in the map frame.')
     initial_pose_yaw: float = option(
         0.0, unit='rad', low=-2.0 * math.pi, high=2.0 * math.pi,
         doc='Initial pose in the map frame.')

@@ -150,6 +150,13 @@ def test_initial_pose_that_is_not_finite_is_refused(value: float):
     assert refusal(c.read_initial_pose, message, 'map') == 'initialpose_covariance'
 
 
+@pytest.mark.parametrize('value', [-1e9, 1e300])
+def test_a_pose_beyond_the_earth_is_refused(value: float):
+    message = good_prior()
+    message.pose.pose.position.y = value
+    assert refusal(c.read_initial_pose, message, 'map') == 'initialpose_pose'
+
+
 def test_initial_pose_with_a_wrong_frame_rotation_or_covariance_is_refused():
     message = good_prior()
     for frame in ('odom', '/map', ''):
