@@ -22,7 +22,7 @@ import itertools
 import math
 from typing import Any
 
-from nccs_pose.errors import FrameRefusedError
+from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.estimate import Estimate, State
@@ -439,6 +439,15 @@ def test_a_tracked_pose_that_explains_the_image_is_kept() -> None:
     drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
     for _ in range(6):
         assert drive.right(drive.go(Pose2(0.05, 0.0, 0.1)))
+
+
+@pytest.mark.parametrize('line', [
+    Line(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), name='odd one'),
+    Line(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), name='odd one'),
+    Line(np.array([0.0, 0.0, 0.01]), np.array([1.0, 0.0, 0.01]), width=0.05, name='odd one')])
+def test_a_line_that_no_image_would_show_is_refused(line: Line) -> None:
+    with pytest.raises(GeometryError, match='odd one'):
+        Localiser(SCENE.rig, LineMap((*RECTANGLE, line)))
 
 
 # ---------------------------------------------------------------- directions left open

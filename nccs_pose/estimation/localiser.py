@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 import math
 
-from nccs_pose.errors import FrameRefusedError
+from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.decision import left_open, the_one_expected
@@ -82,9 +82,15 @@ class Localiser:
     ) -> None:
         """Prepare the tables of a rig.
 
-        :raises GeometryError: if the rig sees no floor.
+        :raises GeometryError: if the rig sees no floor, or a line is no tape on it.
         :raises VisionError: if the map names a colour that is none.
         """
+        for k, line in enumerate(line_map):
+            if not line.is_tape:
+                raise GeometryError(
+                    f'line {line.name or k} from {line.start.tolist()} to {line.end.tolist()}, '
+                    f'width {line.width:g} m, is no tape on the floor: images show only those '
+                    'with z = 0 and a width')
         self._map = line_map
         self._table = FloorTable(rig, options.reach)
         self._symmetries = map_symmetries(line_map)[1:]

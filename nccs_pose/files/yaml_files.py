@@ -35,6 +35,9 @@ import numpy as np
 
 DISTORTION_MODELS = ('plumb_bob', 'rational_polynomial')
 
+FARTHEST = 1e7
+"""Metres from the map's origin: enough for any grid on the earth, too little for millimetres."""
+
 _Value = TypeVar('_Value')
 
 
@@ -74,6 +77,9 @@ def load_map(path: str | Path) -> LineMap:
         line = _line(section, width, colour, default_name=f'line{index}')
         if line.name in [other.name for other in lines]:
             raise section.error('name', f'is given twice in the map: {line.name!r}')
+        twin = next((other for other in lines if _same(line, other)), None)
+        if twin is not None:
+            raise section.error('', f'(line {line.name!r}) is line {twin.name!r} once more')
         lines.append(line)
     if len(lines) < 2:
         raise top.error('lines', f'must hold at least 2 lines, it holds {len(lines)}')
@@ -156,9 +162,18 @@ def _line(section: Section, width: float, colour: str, default_name: str) -> Lin
     return _build(section, '', lambda: Line(start, end, width, colour, name))
 
 
+def _same(line: Line, other: Line) -> bool:
+    """Whether two lines have their ends in the same places."""
+    ends, theirs = (np.array([each.start, each.end]) for each in (line, other))
+    return any(np.allclose(ends, there, rtol=0.0, atol=1e-3) for there in (theirs, theirs[::-1]))
+
+
 def _point(section: Section, key: str) -> np.ndarray:
     """Two numbers, on the ground, or three."""
     point = section.numbers(key, (2, 3), unit='m')
+    if np.abs(point).max() > FARTHEST:
+        raise section.error(
+            key, f'must lie within {FARTHEST:g} m of the origin, not at {point.tolist()}')
     return point if point.size == 3 else np.append(point, 0.0)
 
 

@@ -80,6 +80,11 @@ class Line:
         """Whether d_z = 0, so that the closed form for floor lines holds."""
         return abs(float(self.direction[2])) < 1e-9
 
+    @cached_property
+    def is_tape(self) -> bool:
+        """Whether it is a tape on the floor: z = 0, and a width, so that an image shows it."""
+        return self.width > 0.0 and self.is_horizontal and abs(float(self.start[2])) < 1e-6
+
     def edges(self) -> tuple[Line, Line]:
         """The right and the left edge of the tape, each a line of no width."""
         left = np.array([-self.direction[1], self.direction[0], 0.0])
