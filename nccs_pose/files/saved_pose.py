@@ -22,8 +22,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 import hashlib
 import json
-import math
 from pathlib import Path
+import sys
 from typing import Any
 
 from nccs_pose.errors import FileError
@@ -98,8 +98,10 @@ def read_saved_pose(path: str | Path) -> SavedPose | None:
 
 def _number(path: Path, content: dict[str, Any], key: str) -> float | int:
     value = content.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise FileError(f'{path}: {key} = {value!r} is no finite number')
+    # JSON knows whole numbers that no float holds.
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (
+            abs(value) <= sys.float_info.max):
+        raise FileError(f'{path}: {key} = {str(value)[:40]} is no finite number')
     return value
 
 
@@ -107,9 +109,9 @@ def _covariance(path: Path, content: dict[str, Any]) -> Array:
     key = 'covariance_x_y_yaw'
     try:
         covariance = np.array(content.get(key), dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FileError(f'{path}: {key} is no 3 x 3 matrix') from error
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or (
-            np.linalg.eigvalsh(covariance)[0] <= 0.0):
+            not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] <= 0.0):
         raise FileError(f'{path}: {key} is no covariance: {covariance.tolist()}')
     return covariance

@@ -170,6 +170,7 @@ class LocaliserNode(LifecycleNode):
             self._report_diagnostics)
         if self._options.tf_mode == 'map_to_odom':
             self._retry_timer.reset()
+        self._settings.warn_of_unused()
 
     def _deactivate(self) -> None:
         self._retry_timer.cancel()

@@ -98,6 +98,14 @@ class NodeParameters:
             raise OptionError('; '.join(self.refused.values()))
         return self._build({})
 
+    def warn_of_unused(self) -> None:
+        """Name every override of a quality of service that no topic has taken."""
+        for name in self._overrides:
+            if name.startswith('qos_overrides.') and not self._node.has_parameter(name):
+                self._node.get_logger().warning(
+                    f'parameter {name} has no effect: a topic is named in full, as it is remapped '
+                    'to; reliability, depth and history can be set')
+
     def _declare(self, field: dataclasses.Field[Any]) -> None:
         value = field.default
         # As anything first: rclpy itself would die of a wrong type, an int for a float included.

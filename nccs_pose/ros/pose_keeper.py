@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import time
 from typing import Any
 
@@ -27,6 +26,7 @@ from nccs_pose.files.saved_pose import map_hash, read_saved_pose, SavedPose, wri
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.ros.resources import expanded
 import numpy as np
 
 
@@ -35,7 +35,7 @@ class PoseKeeper:
 
     def __init__(self, options: NodeOptions, line_map: LineMap, logger: Any) -> None:
         self._options = options
-        self._path = Path(options.saved_pose_file).expanduser()
+        self._path = expanded(options.saved_pose_file)
         self._map_hash = map_hash(line_map)
         self._logger = logger
         self._good: SavedPose | None = None

@@ -17,8 +17,11 @@
 from __future__ import annotations
 
 from nccs_pose.ros.interface import Endpoint
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+
+MOST_KEPT = 100_000
 
 
 def profile(endpoint: Endpoint) -> QoSProfile:
@@ -35,4 +38,12 @@ def profile(endpoint: Endpoint) -> QoSProfile:
 
 def overridable() -> QoSOverridingOptions:
     """Let parameters `qos_overrides.<topic>.<publisher|subscription>.<policy>` override it."""
-    return QoSOverridingOptions.with_default_policies()
+    return QoSOverridingOptions.with_default_policies(callback=_check)
+
+
+def _check(qos: QoSProfile) -> SetParametersResult:
+    """Refuse in words a depth of which the middleware only says that it failed."""
+    good = 1 <= qos.depth <= MOST_KEPT
+    return SetParametersResult(
+        successful=good,
+        reason='' if good else f'depth = {qos.depth}: must lie in [1, {MOST_KEPT}]')

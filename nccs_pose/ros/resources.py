@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import sys
 
@@ -39,9 +40,14 @@ def share_directory() -> Path:
         return Path(sys.prefix) / 'share' / PACKAGE
 
 
+def expanded(path: str) -> Path:
+    """A path with `~` and `~user` filled in; where there is no such user it stays as it is."""
+    return Path(os.path.expanduser(path))
+
+
 def resolve(path: str) -> Path:
     """A file as the user meant it: as given if it is there, else below the share directory."""
-    given = Path(path).expanduser()
+    given = expanded(path)
     if given.is_absolute() or given.exists():
         return given
     shipped = share_directory() / given

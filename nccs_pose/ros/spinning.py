@@ -29,6 +29,7 @@ from typing import Any
 
 from nccs_pose.ros.start import initialise, leave, StartError, undisturbed
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
@@ -90,7 +91,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     `close()`, called before it is destroyed.
 
     :returns: exit code: 0 after SIGINT, SIGTERM or an orderly shutdown, 2 if the ROS arguments
-        cannot be read.
+        cannot be read or used.
     """
     node: Node | None = None
     try:
@@ -103,6 +104,9 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         pass
     except StartError as error:
         print(error, file=sys.stderr)
+        return 2
+    except ParameterException as error:  # of use_sim_time and others that rclpy itself declares
+        print(f'cannot start: {error}', file=sys.stderr)
         return 2
     except Exception:
         if rclpy.ok():  # else: shut down while the node was made

@@ -105,7 +105,25 @@ def test_parameters_are_described_checked_and_changed(world):
     assert node.running()
 
 
+@pytest.mark.parametrize('name', ['use_sim_time', 'start_type_description_service'])
+def test_a_parameter_of_rclpy_itself_of_another_type_is_named(world, name):
+    node = world.localiser('-p', f'{name}:=1', **ROOM)
+    assert node.wait() == 2
+    assert f"cannot start: Trying to set parameter '{name}' to '1'" in node.output
+    assert 'Traceback' not in node.output
+
+
+def test_an_impossible_depth_is_named(world):
+    depth, user = 'qos_overrides./odom.subscription.depth', world.user
+    node = world.localiser('-p', f'{depth}:=-1', **ROOM)
+    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'inactive'), node.output
+    assert '/odom' in node.output
+    assert 'depth = -1: must lie in' in node.output
+
+
 def test_unknown_parameter_is_named_with_the_one_meant(world):
-    node, user = world.localiser(map_fil='x', **ROOM), world.user
+    misspelt = 'qos_overrides./image.subscription.reliabilty'
+    node, user = world.localiser('-p', f'{misspelt}:=reliable', map_fil='x', **ROOM), world.user
     assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'active')
     assert 'parameter map_fil is unknown and has no effect; did you mean map_file?' in node.output
+    assert f'parameter {misspelt} has no effect' in node.output

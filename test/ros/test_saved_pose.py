@@ -47,6 +47,8 @@ def test_round_trip(tmp_path):
     ('x_m', 'NaN'), ('yaw_rad', 'null'), ('stamp_ns', '"now"'), ('y_m', 'true'),
     ('covariance_x_y_yaw', '[[1, 0], [0, 1]]'), ('covariance_x_y_yaw', '"much"'),
     ('covariance_x_y_yaw', '[[1, 0, 0], [0, -1, 0], [0, 0, 1]]'),
+    ('covariance_x_y_yaw', '[[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]'),
+    ('x_m', f'1{400 * "0"}'), ('covariance_x_y_yaw', f'[[1{400 * "0"}, 0, 0]]'),
 ])
 def test_what_is_wrong_is_named(tmp_path, key, value):
     path = tmp_path / 'pose.json'
@@ -104,3 +106,5 @@ def test_pose_is_saved_at_the_end_and_offered_at_the_next_start(world, arena, tm
     damaged = world.localiser(saved_pose_file=path, **ARENA)
     assert user.wait(lambda: 'the saved pose is not used' in damaged.output), damaged.output
     assert damaged.running()
+    nobody = world.localiser('-r', '__node:=other', saved_pose_file='~no_such_user/x', **ARENA)
+    user.meet(nobody, 'other')
