@@ -311,6 +311,21 @@ def test_help_is_complete_and_explains_every_command(capsys: Capture) -> None:
         assert text.startswith(f'usage: nccs-pose {command.name} ')
 
 
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['replay', 'bag', '--overlays', '-1'], "'-1' is no whole number from 0 on"),
+    (['render', 'bag', '--quality', '101'], "'101' is no whole number from 0 to 100"),
+    (['render', 'bag', '--seed', '-1'], "'-1' is no whole number"),
+    (['check', 'bag', '--images', '0'], "'0' is no whole number from 1 on"),
+    (['evaluate', 'a', 'b', '--max-gap', 'nan'], "'nan' is no time"),
+    (['evaluate', 'a', 'b', '--tolerance', '-1'], "'-1' is no time")])
+def test_a_number_out_of_its_range_is_named(
+    arguments: list[str], words: str, capsys: Capture,
+) -> None:
+    code, _, err = said(capsys, arguments)
+    assert code == 2
+    assert f'argument {arguments[-2]}: {words}' in err
+
+
 @pytest.mark.parametrize('arguments', [[], ['fly'], ['replay'], ['replay', '--nonsense']])
 def test_wrong_usage_ends_with_2(arguments: list[str], capsys: Capture) -> None:
     code, _, err = said(capsys, arguments)

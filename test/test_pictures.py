@@ -20,17 +20,39 @@ from pathlib import Path
 
 from calibration_reader import read_calibration
 import cv2
+from nccs_pose.errors import FileError
 from nccs_pose.estimation.estimate import Estimate, Quality, State
 from nccs_pose.evaluation.metrics import compare
 from nccs_pose.evaluation.overlay import draw_overlay, predicted_curves
 from nccs_pose.evaluation.plots import error_figure, histogram_figure, trajectory_figure
 from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.image_folder import image_files, read_images
 from nccs_pose.files.pictures import save_figure, save_image
 from nccs_pose.files.trajectories import read_tum
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.vision.line_points import LinePoints
 import numpy as np
 import pytest
+
+
+def test_a_folder_of_images_gives_pixels_as_they_lie_and_no_half_image(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    jpeg = cv2.imencode('.jpg', image)[1].tobytes()
+    # Exif: orientation (0x0112) 6, to be turned by a quarter.
+    exif = (b'Exif\x00\x00MM\x00*\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01'
+            b'\x00\x06\x00\x00\x00\x00\x00\x00')
+    turned = jpeg[:2] + b'\xff\xe1' + (len(exif) + 2).to_bytes(2, 'big') + exif + jpeg[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (32, 24, 3)
+    (tmp_path / '0.jpg').write_bytes(turned)
+    (tmp_path / '1.bmp').write_bytes(cv2.imencode('.bmp', image)[1].tobytes())
+    read = dict(read_images(image_files(tmp_path)))
+    assert [i.shape for i in read.values()] == 2 * [(24, 32, 3)]
+    np.testing.assert_array_equal(read[100_000_000], image)
+    bad = {'half.jpg': jpeg[:len(jpeg) // 2], 'none.png': b'', 'x.bmp': b'x'}
+    for name, content in bad.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FileError, match=f'{name}: is no readable image'):
+            list(read_images([tmp_path / name]))
 
 
 def test_predicted_curves_run_along_the_tapes_of_the_image(ray_traced: Path) -> None:

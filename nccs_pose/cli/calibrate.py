@@ -26,6 +26,7 @@ from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.outline import find_outline
 from nccs_pose.calibration.procedure import Calibration
 from nccs_pose.calibration.rim import rig_from_outline
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import OptionError
 from nccs_pose.files.pictures import save_figure
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='set an option of the calibration: ' + ', '.join(
             f.name for f in dataclasses.fields(CalibrationOptions)
             if not isinstance(f.default, bool)) + '; may be given again')
-    parser.add_argument('--images', type=int, default=150, metavar='N',
+    parser.add_argument('--images', type=whole(1), default=150, metavar='N',
                         help='look at this many images at most (default %(default)s)')
     parser.add_argument('--image-topic', metavar='TOPIC', help='if the bag has several')
 
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = _options(args)
     check_writable(args.output)
-    images = DriveImages(args.bag, max(1, args.images), args.image_topic)
+    images = DriveImages(args.bag, args.images, args.image_topic)
     images.check_size(rig.camera)
     if args.from_rim:
         rig = _from_rim(rig, images, options)

@@ -23,6 +23,7 @@ from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
 from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
 from nccs_pose.calibration.parameters import RigModel
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
 from nccs_pose.files.yaml_files import load_map, load_rig
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--pose-error', type=float, default=5.0, metavar='MM',
         help='pose error that matters, mm (default %(default)s)')
-    parser.add_argument('--images', type=int, default=150, metavar='N',
+    parser.add_argument('--images', type=whole(1), default=150, metavar='N',
                         help='look at this many images at most (default %(default)s)')
     parser.add_argument('--image-topic', metavar='TOPIC', help='if the bag has several')
 
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = MonitorOptions(
         least_frames=_FEWEST, memory=100000, pose_error=1e-3 * args.pose_error)
-    images = DriveImages(args.bag, max(1, args.images), args.image_topic)
+    images = DriveImages(args.bag, args.images, args.image_topic)
     images.check_size(rig.camera)
     monitor = CalibrationMonitor(rig, line_map, options)
     # Under a rig that is off, poses are doubted, and tell most of all what is wrong.

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.coverage import coverage_table, run_scenario, Scenario, SCENARIOS
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--trials', type=int, default=60, metavar='N',
         help='images of each scenario (default: %(default)s)')
     parser.add_argument(
-        '--seed', type=int, default=3, help='of poses and noise (default: %(default)s)')
+        '--seed', type=whole(0), default=3, help='of poses and noise (default: %(default)s)')
     parser.add_argument('--output', type=Path, metavar='FILE', help='write the table there')
 
 

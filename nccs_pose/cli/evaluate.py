@@ -19,6 +19,7 @@ import argparse
 import json
 from pathlib import Path
 
+from nccs_pose.cli.argument_types import seconds
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.tables import as_numbers, summary_table
@@ -36,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='images that the trajectory was made from, to count those not answered '
              '(default: as many as there are poses)')
     parser.add_argument(
-        '--max-gap', type=float, default=0.2, metavar='S',
+        '--max-gap', type=seconds, default=0.2, metavar='S',
         help='seconds between true poses that may be interpolated across (default %(default)s)')
     parser.add_argument(
-        '--tolerance', type=float, default=0.001, metavar='S',
+        '--tolerance', type=seconds, default=0.001, metavar='S',
         help='seconds within which a true pose is taken as it is (default %(default)s)')
     parser.add_argument(
         '--output', type=Path, metavar='FILE',

@@ -21,6 +21,7 @@ import argparse
 import json
 from pathlib import Path
 
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.precision import as_numbers, precision_table, run_precision
 from nccs_pose.files.text_files import write_text
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--noise', type=float, default=0.05, metavar='SHARE',
         help='noise of every channel over full scale (default: %(default)s)')
     parser.add_argument(
-        '--seed', type=int, default=1, help='of poses and noise (default: %(default)s)')
+        '--seed', type=whole(0), default=1, help='of poses and noise (default: %(default)s)')
     parser.add_argument(
         '--output', type=Path, metavar='DIR',
         help='write precision.md and precision.json there')

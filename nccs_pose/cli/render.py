@@ -19,6 +19,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
 from nccs_pose.files.bags import BagWriter
@@ -58,9 +59,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--compression', choices=('none', 'jpeg', 'png'), default='jpeg',
         help='of the images in the bag (default %(default)s)')
-    parser.add_argument('--quality', type=int, default=92, help='of JPEG (default %(default)s)')
     parser.add_argument(
-        '--seed', type=int, default=0, help='of all noise; same seed, same bag')
+        '--quality', type=whole(0, 100), default=92, help='of JPEG (default %(default)s)')
+    parser.add_argument(
+        '--seed', type=whole(0), default=0, help='of all noise; same seed, same bag')
 
 
 def run(args: argparse.Namespace) -> int:

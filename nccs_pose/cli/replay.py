@@ -24,6 +24,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.offline_run import (
     answered_poses,
@@ -74,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
              'POSES.evaluation.json')
     parser.add_argument('--plots', type=Path, metavar='DIR', help='folder for pictures')
     parser.add_argument(
-        '--overlays', type=int, default=6, metavar='N',
+        '--overlays', type=whole(0), default=6, metavar='N',
         help='images to draw detections and prediction on, with --plots (default %(default)s)')
     parser.add_argument(
         '--method', choices=sorted(_METHODS), default='nccs',

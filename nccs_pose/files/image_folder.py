@@ -20,9 +20,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
-from nccs_pose.errors import FileError
-from nccs_pose.vision.decode import Image
+from nccs_pose.errors import FileError, VisionError
+from nccs_pose.vision.decode import decode_compressed, Image
 import numpy as np
+from numpy.typing import NDArray
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff')
 _PERIOD_NS = 100_000_000  # between images that carry no time
@@ -44,7 +45,20 @@ def read_images(files: list[Path]) -> Iterator[tuple[int, Image]]:
             data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
         except OSError as error:
             raise FileError(f'{path}: cannot be read: {error.strerror or error}.') from error
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-        if image is None:
-            raise FileError(f'{path}: is no readable image.')
+        try:
+            image = _decode(data)
+        except (VisionError, cv2.error) as error:
+            words = ' '.join(str(error).split())
+            raise FileError(f'{path}: is no readable image: {words}.') from error
         yield number * _PERIOD_NS, image
+
+
+def _decode(data: NDArray[np.uint8]) -> Image:
+    """As in a bag: whole, and as the pixels lie, however the camera was turned."""
+    if data[:2].tobytes() in (b'\xff\xd8', b'\x89P'):
+        return decode_compressed('', data)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise VisionError('its content is none that OpenCV reads')
+    return np.asarray(image, np.uint8)

@@ -1,0 +1,46 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Numbers on the command line that must lie in a range; argparse says so where they do not."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+import math
+
+
+def whole(low: int, high: int | None = None) -> Callable[[str], int]:
+    """A whole number from `low` on, up to `high` if given."""
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = None
+        if value is None or value < low or (high is not None and value > high):
+            end = 'on' if high is None else f'to {high}'
+            raise argparse.ArgumentTypeError(f'{text!r} is no whole number from {low} {end}')
+        return value
+
+    return parse
+
+
+def seconds(text: str) -> float:
+    """A time, 0 or longer."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} is no time in seconds, 0 or longer')
+    return value
