@@ -41,10 +41,12 @@ from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader
 from nccs_pose.files.pictures import save_figure, save_image
 from nccs_pose.files.serialised_bag import SerialisedBag
+from nccs_pose.files.text_files import check_writable
 from nccs_pose.files.yaml_files import load_map
+from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_ns
-from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
+from nccs_pose.ros.player import Playback, Player, positive, wait_for_subscribers
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images
@@ -133,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--bag', default='bags/room', help='bag to play (default bags/room)')
     parser.add_argument('--params', default='config/room.yaml', help="the localiser's parameters")
     parser.add_argument('--map', default='config/room_map.yaml', help='map, for the plot')
-    parser.add_argument('--rate', type=float, default=1.0, help='speed factor (default 1)')
+    parser.add_argument('--rate', type=positive, default=1.0, help='speed factor (default 1)')
     parser.add_argument('--output', default='out', type=Path, help='folder for the pictures')
     options = parser.parse_args(argv)
     use_large_images()
@@ -155,6 +157,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    # Before the drive, not after it.
+    line_map = load_map(resolve(options.map))
+    check_writable(options.output / 'trajectory.png')
     bag_path = resolve(options.bag)
     with BagReader(bag_path) as reader:
         truth, topics = reader.ground_truth(), reader.topics
@@ -184,7 +189,7 @@ def _demo(options: argparse.Namespace) -> int:
             # Before ROS itself, which would leave the callback that is due for Python to warn of.
             executor.shutdown(5.0)
             spinning.join(5.0)
-    return _conclude(record, truth, options, user.pictures)
+    return _conclude(record, truth, line_map, options.output, user.pictures)
 
 
 def _start_localiser(
@@ -266,7 +271,7 @@ class Progress:
 
 
 def _conclude(
-    record: Record, truth: Trajectory, options: argparse.Namespace, pictures: list[Path],
+    record: Record, truth: Trajectory, line_map: LineMap, output: Path, pictures: list[Path],
 ) -> int:
     estimated = record.trajectory()
     errors = compare(estimated, truth)
@@ -279,10 +284,9 @@ def _conclude(
             ['latency, image to pose', 'median', '95 %', 'max'],
             ['ms', *(f'{v:.1f}' for v in (*np.percentile(latency, (50, 95)), latency.max()))]]))
         covariance = np.array([record.covariances[s] for s in errors.stamps_ns.tolist()])
-        output = options.output
         for figure, name in (
-            (trajectory_figure(estimated, truth, load_map(resolve(options.map)),
-                               'Estimated over ROS 2 and true'), 'trajectory.png'),
+            (trajectory_figure(estimated, truth, line_map, 'Estimated over ROS 2 and true'),
+             'trajectory.png'),
             (error_figure(errors, covariance, 'Errors against the truth'), 'errors.png'),
         ):
             save_figure(figure, output / name)

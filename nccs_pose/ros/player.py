@@ -215,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='play', description='Publish the topics of a rosbag2 with their recorded timing. '
         'Topics are remapped as of any node: --ros-args -r /camera/image_raw:=/image.')
     parser.add_argument('bag', help='folder of the bag')
-    parser.add_argument('--rate', type=_positive, default=1.0, help='speed factor (default 1)')
+    parser.add_argument('--rate', type=positive, default=1.0, help='speed factor (default 1)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
     parser.add_argument('--start-offset', type=_seconds, default=0.0, metavar='S',
                         help='seconds of the bag to leave out')
@@ -238,7 +238,8 @@ def _number(text: str) -> float:
     return value
 
 
-def _positive(text: str) -> float:
+def positive(text: str) -> float:
+    """A number above 0, of the command line."""
     value = _number(text)
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f'{text} must be greater than 0')

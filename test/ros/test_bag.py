@@ -127,3 +127,16 @@ def test_player_says_what_it_cannot_play(world, arguments, words):
     assert player.wait() == 2
     assert words in player.output
     assert 'Traceback' not in player.output
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--rate', '0'], 'must be greater than 0'),
+    (['--map', 'no/map.yaml'], 'no/map.yaml: cannot be read'),
+    (['--output', '/proc/nowhere'], '/proc/nowhere/trajectory.png: cannot be written'),
+])
+def test_the_demo_says_what_it_cannot_do_before_it_drives(world, arguments, words):
+    demo = world.start('demo', *arguments)
+    assert demo.wait() == 2
+    assert words in demo.output
+    assert 'playing' not in demo.output
+    assert 'Traceback' not in demo.output
