@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
@@ -160,8 +160,4 @@ class LineColour:
             return self
         step = min(max(unit * float(height.dot(left)) / total, -_BLUR_STEP), _BLUR_STEP)
         least, most = _BLUR_RANGE
-        sharper = LineColour(
-            self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most))
-        # What does not depend on the blur is not worked out again.
-        vars(sharper)['discriminant'] = self.discriminant
-        return sharper
+        return replace(self, blur=min(max(self.blur + step, least), most))
