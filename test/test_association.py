@@ -248,6 +248,22 @@ def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
     assert len(candidates) <= 300
 
 
+def test_equal_places_are_told_alike_however_the_strips_lie(table: FloorTable) -> None:
+    crosses = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
+    line_map = LineMap(tuple(
+        line for x, y in crosses
+        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+    pose = Pose2(11.0, 5.0, 2.0)
+    strips = _strips(line_map, pose, np.random.default_rng(25), noise=0.06)
+    candidates = Associator(line_map, table).candidates(strips).fitted
+    places = [Pose2(pose.x + 3.0 * i, pose.y + 3.0 * j, pose.yaw)
+              for i in range(-3, 4) for j in range(-1, 2)]
+    told = np.array([
+        min((c.pose.minus(place) for c in candidates), key=lambda off: float(off @ off))
+        for place in places])
+    assert (np.abs(told - np.median(told, axis=0)) < [0.01, 0.01, 0.005]).all()
+
+
 def test_where_many_hundreds_of_places_are_equal_all_are_told(table: FloorTable) -> None:
     places = np.arange(21.0)
     line_map = LineMap((*(_line((0.0, y), (20.0, y)) for y in places),

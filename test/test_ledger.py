@@ -74,9 +74,9 @@ def test_a_pose_is_known_with_its_twins() -> None:
 
 def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
     twin = HALF_TURN @ HERE
-    assert _ledger((HALF_TURN,), None, ()).hold(_found(HERE, 0.9), 0.0) == []
+    assert _ledger((HALF_TURN,), None, ()).hold(_found(HERE, 0.9), None) == []
     ledger = _ledger((HALF_TURN,), _told(twin), ())
-    assert ledger.hold(_found(HERE, 0.9), 0.0) == [twin]
+    assert ledger.hold(_found(HERE, 0.9), None) == [twin]
     assert not ledger.knows(twin)
     assert ledger.closed().open == []
 
@@ -84,7 +84,7 @@ def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
 def test_what_holds_leaves_its_twins_open() -> None:
     for told in (None, _told(HERE)):
         ledger = _ledger((HALF_TURN,), told, ())
-        ledger.hold(_found(HERE, 0.9), 0.0)
+        ledger.hold(_found(HERE, 0.9), None)
         twin, = ledger.closed().open
         assert twin.pose == HALF_TURN @ HERE
         assert twin.score == 0.9
@@ -94,7 +94,7 @@ def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() 
     left = [_strips(THERE, 0.7), _strips(NOWHERE, 0.6), _strips(HERE, 0.8)]
     ledger = _ledger((), None, left)
     assert ledger.closed().open == []
-    ledger.hold(_found(HERE, 0.9, by_strips=0.8), 0.0)
+    ledger.hold(_found(HERE, 0.9, by_strips=0.8), None)
     ledger.leave(_strips(HALF_TURN @ HERE, 0.95))
     opened = ledger.closed().open
     assert [c.pose for c in opened] == [HALF_TURN @ HERE, THERE]
@@ -107,7 +107,7 @@ def test_the_others_that_explain_the_strips_are_the_rest() -> None:
     ledger = _ledger((), None, [
         _strips(THERE, 0.6), _strips(away[0], 0.6, claimed=0.9), _strips(away[3], 0.7),
         _strips(HERE @ Pose2(0.1, 0.1, 0.0), 0.6)], [HERE, NOWHERE])
-    ledger.hold(_found(HERE, 0.8, by_strips=0.8), 0.5)
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _strips(HERE, 0.8, misfit=0.5))
     ledger.pass_over(_strips(away[2], 0.6, misfit=1.5))
     sifted = ledger.closed()
     # One leaves strips unexplained, and one is the pose that holds.
@@ -117,17 +117,27 @@ def test_the_others_that_explain_the_strips_are_the_rest() -> None:
     assert sifted.others.listed() == [NOWHERE]
 
 
+def test_what_was_not_laid_lies_off_its_strips_as_the_best_does() -> None:
+    moved = Pose2(0.04, -0.02, 0.01)
+    ledger = _ledger((), None, [_strips(THERE, 0.8), _strips(NOWHERE, 0.5)])
+    ledger.hold(_found(HERE @ moved, 0.9), _strips(HERE, 0.8))
+    # A worse one says nothing of it.
+    ledger.hold(_found(HALF_TURN @ HERE, 0.4), _strips(HALF_TURN @ HERE, 0.4))
+    sifted = ledger.closed()
+    assert [c.pose for c in (*sifted.open, *sifted.rest)] == [THERE @ moved, NOWHERE @ moved]
+
+
 def test_a_pose_is_beaten_by_what_holds_unless_more_of_it_may_be_there() -> None:
     ledger = _ledger((), None, ())
     assert not ledger.beats(_strips(THERE, 0.1))
-    ledger.hold(_found(HERE, 0.8, by_strips=0.8), 0.5)
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _strips(HERE, 0.8, misfit=0.5))
     # 0.85 of 0.8, squared.
     assert ledger.beats(_strips(THERE, 0.45)) and not ledger.beats(_strips(THERE, 0.47))
     assert ledger.beats(_strips(THERE, 0.7, misfit=1.0))
     assert not ledger.beats(_strips(THERE, 0.7, misfit=0.5))
     plain = _ledger((), None, ())
     plain.hold(replace(_found(HERE, 0.8), alignment=SimpleNamespace(
-        pose=HERE, support=np.ones(3), explained=1.0)), 0.0)
+        pose=HERE, support=np.ones(3), explained=1.0)), None)
     assert plain.beats(_strips(THERE, 0.6, claimed=0.9))
     assert not plain.beats(_strips(THERE, 0.6, claimed=0.97))
 
@@ -136,7 +146,7 @@ def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
     for best, opens in ((0.5, True), (0.9, False)):
         ledger = _ledger((), None, ())
         ledger.doubt(AWAY, _found(THERE, 0.6))
-        ledger.hold(_found(HERE, best), 0.0)
+        ledger.hold(_found(HERE, best), None)
         sifted = ledger.closed()
         assert [c.pose for c in sifted.open] == ([THERE] if opens else [])
         assert [c.pose for c in sifted.hidden] == ([] if opens else [THERE])
@@ -145,11 +155,11 @@ def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
 def test_the_best_is_first_and_tied_by_its_equals() -> None:
     ledger = _ledger((), None, ())
     assert not ledger.is_tied()
-    ledger.hold(_found(HERE, 0.7), 0.4)
-    ledger.hold(_found(THERE, 0.9), 0.2)
+    ledger.hold(_found(HERE, 0.7), _strips(HERE, 0.8, misfit=0.4))
+    ledger.hold(_found(THERE, 0.9), _strips(THERE, 0.8, misfit=0.2))
     assert ledger.best is not None and ledger.best.alignment.pose == THERE
     assert not ledger.is_tied()
-    ledger.hold(_found(NOWHERE, 0.8), 0.0)
+    ledger.hold(_found(NOWHERE, 0.8), None)
     assert ledger.is_tied()
     assert [f.score for f in ledger.closed().held] == [0.9, 0.8, 0.7]
 
@@ -167,7 +177,7 @@ def test_what_something_hides_is_hidden_with_its_twins() -> None:
 def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_open() -> None:
     for best, lines, opens in ((0.5, 3, True), (0.7, 3, False), (0.5, 2, False)):
         ledger = _ledger((), None, ())
-        ledger.hold(_found(HERE, best), 0.0)
+        ledger.hold(_found(HERE, best), None)
         ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
             pose=THERE, support=np.ones(lines), explained=1.0)))
         assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])

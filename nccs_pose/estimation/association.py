@@ -105,9 +105,11 @@ class Associator:
             return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []
         others = _NONE
+        rounds = 2
         if len(poses.place) > _REFINED:
             poses, guessed, others = _promising(scorer, poses, told)
-        poses, claimed, misfit = scorer.refined(poses)
+            rounds = 1
+        poses, claimed, misfit = scorer.refined(poses, rounds)
         score = _harmonic(claimed, scorer.explained(poses))
         found = distinct(poses, score)
         refined = [FittedCandidate(*of) for of in zip(
@@ -151,12 +153,15 @@ def _promising(
     further = best[_CLOSE:]
     others = poses[further[claimed[further] > ALL_STRIPS]]
     best = best[:_CLOSE]
-    poses, claimed, there = poses[best], claimed[best], there[best]
+    # Two strips may lie askew, and so does the pose that they give: all others set it right.
+    poses, claimed, misfit = scorer.refined(poses[best], 2, _COARSE)
+    there = there[best]
     score = _harmonic(claimed, scorer.explained(poses, _COARSE))
     found = sorted(distinct(poses, score), key=lambda k: not there[k])
     guessed = found[_REFINED:]
     return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
-        poses[guessed].listed(), score[guessed].tolist(), claimed[guessed].tolist())], others
+        poses[guessed].listed(),
+        *(part[guessed].tolist() for part in (score, claimed, misfit)))], others
 
 
 def _harmonic(a: Array, b: Array) -> Array:

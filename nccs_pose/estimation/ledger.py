@@ -87,6 +87,8 @@ class Ledger:
         """
         self.best: Found | None = None
         self._best_misfit = 0.0
+        # How the best moved from where its strips put it, in base_link.
+        self._moved = Pose2(0.0, 0.0, 0.0)
         self._symmetries = symmetries
         self._told = told
         self._ratio = ratio
@@ -154,17 +156,19 @@ class Ledger:
         """Note a pose that does not lie on the image."""
         self._settle_twins(pose)
 
-    def hold(self, found: Found, misfit: float) -> list[Pose2]:
+    def hold(self, found: Found, strips: FittedCandidate | None) -> list[Pose2]:
         """Note a pose that holds.
 
-        :param misfit: how far the strips lay off the lines where it was begun from, px.
+        :param strips: what they said of where it was begun from, if they did.
         :returns: those of its twins that have to be laid on the image too.
         """
         self._laid.append(found.alignment.pose)
         self._settle_twins(found.alignment.pose)
         self._held.append(found)
         if self.best is None or found.score > self.best.score:
-            self.best, self._best_misfit = found, misfit
+            self.best = found
+            self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if strips is None else (
+                strips.misfit, strips.pose.inverse() @ found.alignment.pose)
         twins, told = self._twins(found.alignment.pose), self._told
         there = [told is not None and told.holds(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
@@ -248,6 +252,8 @@ class Ledger:
             return []
         # They differ among themselves.
         new = unlike(Poses.of([strips.pose for strips in left]), Poses.of(known))
+        # Strips that lie askew do so at all places where they look the same.
         return [
-            Candidate(strips.pose, min(strips.score / best.by_strips, 1.0) * best.score)
+            Candidate(
+                strips.pose @ self._moved, min(strips.score / best.by_strips, 1.0) * best.score)
             for strips, differs in zip(left, new.tolist()) if differs]

@@ -154,7 +154,7 @@ class Sifter:
             found = self._tried(case, start, ledger)
             if found is not None:
                 starts += (_Start(twin, _SEARCH_BAND)
-                           for twin in ledger.hold(found, start.misfit))
+                           for twin in ledger.hold(found, start.strips))
                 undecided = self._is_undecided(case, ledger)
             elif start.strips is not None and ledger.best is None:
                 in_vain += 1

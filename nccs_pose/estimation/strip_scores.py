@@ -29,7 +29,6 @@ from nccs_pose.geometry.small_matrices import definite_solutions
 import numpy as np
 from numpy.typing import NDArray
 
-_ROUNDS = 2
 # Samples on each strip and on what is near of each map line.
 _SAMPLES = 12
 # No sample of a line counts for more than this, px of the image.
@@ -145,35 +144,40 @@ class StripScorer:
         on = (inside[:len(inside) // 2] & inside[len(inside) // 2:]).any(axis=0)
         return weight.sum(axis=1), (weight * on.reshape(weight.shape)).sum(axis=1)
 
-    def refined(self, poses: Poses) -> tuple[Poses, Array, Array]:
+    def refined(
+        self, poses: Poses, rounds: int, step: int = 1,
+    ) -> tuple[Poses, Array, Array]:
         """Lay the strips on their lines by least squares on the floor, from poses (H,).
 
+        :param rounds: how often.
+        :param step: look at one sample out of so many.
         :returns: the poses, the fraction of the strips' pixels on map lines (H,), and the root
             mean square distance of these (H,), px; 0 if none is on any. Of a last step that is
             small enough both are as it says that they will be.
         """
-        inverse = 1.0 / self._tolerance
-        count = len(poses.place)
-        rows = np.empty((count, 4, len(inverse)))
-        for _ in range(_ROUNDS):
-            on, which, across = self._on_lines(poses)
+        some = slice(step // 2, None, step)
+        tolerance, points, share = self._tolerance[some], self._points[some], self._weight[some]
+        inverse, share = 1.0 / tolerance, share / share.sum()
+        rows = np.empty((len(poses.place), 4, len(inverse)))
+        for _ in range(rounds):
+            on, which, across = self._on_lines(poses, step)
             weight = on * inverse
             normal = self._nearest.normal.take(which) * weight
-            turned = poses.rotation[:, None] * self._points
+            turned = poses.rotation[:, None] * points
             # Derivatives of the distances by x, y and yaw, and the distances.
             rows[:, 0], rows[:, 1] = normal.real, normal.imag
             rows[:, 2] = (normal * turned.conj()).imag
             np.multiply(across, weight, out=rows[:, 3])
             products = rows @ rows.transpose(0, 2, 1)
-            step = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
-            step[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
-            poses = Poses(poses.rotation * np.exp(-1j * step[:, 2]),
-                           poses.place - step[:, 0] - 1j * step[:, 1])
-        across -= (step[:, None] @ rows[:, :3])[:, 0] * self._tolerance
-        on &= np.abs(across) < self._tolerance
-        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre)
-        total = on @ self._weight
-        return poses, total, np.sqrt(square @ self._weight / np.maximum(total, 1e-9))
+            change = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
+            change[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
+            poses = Poses(poses.rotation * np.exp(-1j * change[:, 2]),
+                          poses.place - change[:, 0] - 1j * change[:, 1])
+        across -= (change[:, None] @ rows[:, :3])[:, 0] * tolerance
+        on &= np.abs(across) < tolerance
+        square = np.square(np.where(on, across, 0.0) * self._pixels_per_metre[some])
+        total = on @ share
+        return poses, total, np.sqrt(square @ share / np.maximum(total, 1e-9))
 
 
 def _one_of_each(
