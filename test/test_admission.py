@@ -34,7 +34,7 @@ def _image(height: int, seed: int) -> np.ndarray:
 
 def _admission(height: int, step: float) -> Admission:
     """One that has seen an image, after which the robot went so far, metres."""
-    odometry = Odometry()
+    odometry = Odometry(clock_jump=1.0)
     odometry.add(0, Pose2(0.0, 0.0, 0.0))
     odometry.add(100, Pose2(step, 0.0, 0.0))
     admission = Admission(PinholeCamera(64, height, 50.0, 50.0, 32.0, 24.0), odometry, 1.0)
@@ -52,7 +52,7 @@ def test_an_image_is_frozen_only_if_the_robot_moved_and_no_pixel_changed(height:
 
 
 def test_a_frozen_camera_is_found_on_a_slow_robot_and_until_its_image_changes() -> None:
-    odometry, still, other = Odometry(), _image(48, 0), _image(48, 1)
+    odometry, still, other = Odometry(clock_jump=1.0), _image(48, 0), _image(48, 1)
     admission = Admission(PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0), odometry, 1.0)
     frozen = []
     # More samples than are kept, ten of them an image, in which it moves 3 mm.

@@ -48,7 +48,7 @@ class PaperLocaliser:
     def __init__(self, rig: Rig, line_map: LineMap, options: LocaliserOptions) -> None:
         self._rig, self._map = rig, line_map
         self._starter = Localiser(rig, line_map, options)
-        self._odometry = Odometry()
+        self._odometry = Odometry(options.clock_jump)
         self._last: tuple[int, Pose2] | None = None
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-import math
 
 from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
@@ -55,7 +54,7 @@ from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import what_is_missing
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2, wrapped
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.vision.colour import LineColour
 import numpy as np
@@ -68,10 +67,6 @@ _CLAIMED = 0.5
 _FOREIGN = 0.25
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
-# Wheels roll and turn no faster, m/s and rad/s. What goes this much further, m and rad, from one
-# sample to the next is another start of odometry; less may be the stamps'.
-_FASTEST = (10.0, 20.0)
-_LEAP = (0.1, 0.2)
 
 
 class Localiser:
@@ -94,7 +89,7 @@ class Localiser:
         self._map = line_map
         self._table = FloorTable(rig, options.reach)
         self._symmetries = map_symmetries(line_map)[1:]
-        self._odometry = Odometry()
+        self._odometry = Odometry(options.clock_jump)
         self._admission = Admission(rig.camera, self._odometry, options.clock_jump)
         self.update_options(options)
         self.reset()
@@ -115,8 +110,6 @@ class Localiser:
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""
         self._odometry.clear()
-        # The last sample of odometry.
-        self._wheels: tuple[int, Pose2] | None = None
         self._admission.forget()
         self._colours = self._nominal_colours
         self.relocalise()
@@ -161,36 +154,15 @@ class Localiser:
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
         """Take a sample of wheel odometry, T_odom_base.
 
-        One that is older than the last, by no more than `clock_jump`, is no news.
-
-        :raises FrameRefusedError: `odom_jump`, if it does not follow on the last one: odometry
-            begins anew with it, and no step leads across.
+        :raises FrameRefusedError: `odom_jump`, as of :meth:`.Odometry.add`; no step leads across.
         """
-        last = self._wheels
-        jump = '' if last is None else self._odometry_jump(*last, stamp_ns, pose)
-        if jump:
-            self._odometry.clear()
+        try:
+            self._odometry.add(stamp_ns, pose)
+        except FrameRefusedError:
             self._open_odometry = None
             if self._track is not None:
                 self._track = replace(self._track, odometry=None)
-        if last is None or jump or stamp_ns > last[0]:
-            self._wheels = stamp_ns, pose
-            self._odometry.add(stamp_ns, pose)
-        if jump:
-            raise FrameRefusedError('odom_jump', f'odom: {jump}; odometry begins anew')
-
-    def _odometry_jump(self, before_ns: int, before: Pose2, after_ns: int, after: Pose2) -> str:
-        """How a sample of odometry does not follow on the one before; empty if it does."""
-        seconds = 1e-9 * (after_ns - before_ns)
-        if seconds < -self.options.clock_jump:
-            return f'the stamps jumped back by {-seconds:.3f} s'
-        way = math.hypot(after.x - before.x, after.y - before.y)
-        turn = abs(wrapped(after.yaw - before.yaw))
-        time = min(seconds, 1.0)
-        if seconds > 0.0 and (
-                way > _LEAP[0] + _FASTEST[0] * time or turn > _LEAP[1] + _FASTEST[1] * time):
-            return f'{way:.3g} m and {turn:.3g} rad in {seconds:.3f} s are more than wheels can do'
-        return ''
+            raise
 
     def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> Estimate:
         """Estimate the pose that an image was taken from.

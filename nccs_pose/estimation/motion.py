@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from functools import cached_property
 import math
 
+from nccs_pose.errors import FrameRefusedError
 from nccs_pose.geometry.pose import Array, Pose2, wrapped
 from nccs_pose.geometry.small_matrices import inverse, inverse_3x3
 import numpy as np
@@ -30,6 +31,12 @@ _LONGEST_GAP_NS = 250_000_000
 # Without odometry a velocity is believed for so long, s.
 _LONGEST_COAST = 1.0
 _KEPT = 4000
+# Wheels roll and turn no faster, m/s and rad/s, for no longer than this without a word, s. What
+# goes this much further, m and rad, from one sample to the next is another start of odometry;
+# less may be the stamps'.
+_FASTEST = (10.0, 20.0)
+_LONGEST_ROLL = 1.0
+_LEAP = (0.1, 0.2)
 # What a prediction may be off by beside the motion's own part, metres and rad: it keeps the image,
 # not the prediction, in charge.
 _FLOOR_SIGMA = (0.02, 0.015)
@@ -99,18 +106,46 @@ FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 
 class Odometry:
     """Wheel odometry, interpolated at any stamp it covers."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock_jump: float) -> None:
+        """Begin.
+
+        :param clock_jump: a stamp that goes back further than this is a new start, s.
+        """
+        self._clock_jump = clock_jump
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
 
     def add(self, stamp_ns: int, pose: Pose2) -> None:
-        """Take one sample; one that is not newer than the last is no news."""
-        if self._stamps and stamp_ns <= self._stamps[-1]:
+        """Take one sample; one that is not newer than the last is no news.
+
+        :raises FrameRefusedError: `odom_jump`, if the sample does not follow on the last: all
+            before it is forgotten, and it is the first.
+        """
+        jump = self._jump(stamp_ns, pose)
+        if jump:
+            self.clear()
+        elif self._stamps and stamp_ns <= self._stamps[-1]:
             return
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
         if len(self._stamps) > 2 * _KEPT:
             del self._stamps[:_KEPT], self._poses[:_KEPT]
+        if jump:
+            raise FrameRefusedError('odom_jump', f'odom: {jump}; odometry begins anew')
+
+    def _jump(self, stamp_ns: int, pose: Pose2) -> str:
+        """How a sample does not follow on the last; empty if it does."""
+        if not self._stamps:
+            return ''
+        last, seconds = self._poses[-1], 1e-9 * (stamp_ns - self._stamps[-1])
+        if seconds < -self._clock_jump:
+            return f'the stamps jumped back by {-seconds:.3f} s'
+        way, turn = math.hypot(pose.x - last.x, pose.y - last.y), abs(wrapped(pose.yaw - last.yaw))
+        time = min(seconds, _LONGEST_ROLL)
+        if seconds > 0.0 and (
+                way > _LEAP[0] + _FASTEST[0] * time or turn > _LEAP[1] + _FASTEST[1] * time):
+            return f'{way:.3g} m and {turn:.3g} rad in {seconds:.3f} s are more than wheels can do'
+        return ''
 
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""
