@@ -26,7 +26,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from nccs_pose.errors import FrameRefusedError, NccsPoseError
+from nccs_pose.errors import NccsPoseError, OptionError
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
@@ -148,9 +148,13 @@ class LocaliserNode(LifecycleNode):
         self._options, estimator = self._settings.options()
         for name in ('rig_file', 'map_file'):
             if not getattr(self._options, name):
-                raise FrameRefusedError('configuration', f'parameter {name} is not set')
+                raise OptionError(f'parameter {name} is not set')
         self._rig = rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
+        if line_map.frame != self._options.map_frame:
+            raise OptionError(
+                f'map_frame = {self._options.map_frame!r}, but {self._options.map_file} has '
+                f'frame: {line_map.frame}')
         self._localiser = Localiser(rig, line_map, estimator)
         self._outputs = Outputs(self, self._options, rig, line_map, self._refuse)
         self._keeper = PoseKeeper(self._options, line_map, self.get_logger())

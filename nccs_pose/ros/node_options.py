@@ -39,7 +39,8 @@ class NodeOptions:
         doc='raw subscribes image, compressed subscribes image/compressed.')
     autostart: bool = option(
         True, doc='Configure and activate at start; false waits for a lifecycle manager.')
-    map_frame: str = option('map', doc='Frame of the lines and of the pose.')
+    map_frame: str = option(
+        'map', doc='Frame of the lines and of the pose; the map file has to say the same.')
     odom_frame: str = option('odom', doc='Frame of the odometry (frame_prefix goes before it).')
     base_frame: str = option(
         'base_link', doc='Frame of the robot on the ground (frame_prefix goes before it).')

@@ -72,6 +72,7 @@ BAD_CONFIGURATIONS = [
     ({'map_file': 'nowhere/map.yaml'}, 'nowhere/map.yaml'),
     ({'rig_file': 'config/room_map.yaml'}, 'room_map.yaml'),
     ({'rig_file': None}, 'rig_file is not set'),
+    ({'map_frame': 'moon'}, "map_frame = 'moon', but config/room_map.yaml has frame: map"),
     ({'tf_mode': 'map_to_moon'}, 'tf_mode'),
     ({'camera_info_tolerance': 7.5}, 'camera_info_tolerance'),
     ({'silence_warning': 'soon'}, 'silence_warning'),
