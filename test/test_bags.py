@@ -334,6 +334,28 @@ def test_a_pose_that_is_none_is_refused_with_its_topic(
         reader.ground_truth()
 
 
+def test_odometry_that_is_no_pose_is_left_out_and_said(tmp_path: Path) -> None:
+    """As some drivers send it first; the node refuses it and goes on."""
+    make = TYPES.types
+    with BagWriter(tmp_path / 'bag') as writer:
+        for k in range(3):
+            writer.write_image(T0 + k, PICTURE)
+            pose = make['geometry_msgs/msg/Pose'](
+                make['geometry_msgs/msg/Point'](1.0, 2.0, 0.0),
+                make['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, float(k > 0)))
+            zero = make['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+            writer._write('/odom', 'nav_msgs/msg/Odometry', T0 + k, {
+                'header': header(), 'child_frame_id': 'base_link',
+                'pose': make['geometry_msgs/msg/PoseWithCovariance'](pose, np.zeros(36)),
+                'twist': make['geometry_msgs/msg/TwistWithCovariance'](
+                    make['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36))})
+    with BagReader(tmp_path / 'bag') as reader:
+        kinds = [type(event) for event in reader.events()]
+    assert (kinds.count(StampedImage), kinds.count(StampedOdometry)) == (3, 2)
+    (words,) = reader.left_out
+    assert '/odom at 5000000006 ns: quaternion (0.0, 0.0, 0.0, 0.0) is no rotation' in words
+
+
 def test_an_uncalibrated_camera_info_is_no_camera(tmp_path: Path) -> None:
     region = TYPES.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False)
     info = TYPES.types['sensor_msgs/msg/CameraInfo'](

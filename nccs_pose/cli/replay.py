@@ -114,6 +114,10 @@ def run(args: argparse.Namespace) -> int:
                 _METHODS[args.method](rig, line_map, options),
                 bag.events(odometry=not args.no_odometry), on_frame)
         used = dataclasses.asdict(bag.topics)
+        if bag.left_out:
+            print(
+                f'nccs-pose replay: warning: {len(bag.left_out)} odometry messages were left out, '
+                f'the first: {bag.left_out[0]}', file=sys.stderr)
     estimated, covariances = answered_poses(records)
     write_tum(estimated, args.output)
     write_text(_beside(args.output, 'frames.jsonl'), ''.join(map(record_line, records)))

@@ -51,6 +51,7 @@ class BagReader:
 
     :param path: a rosbag2 folder (or a single .mcap, .db3 or ROS 1 .bag file).
     :param topics: names of topics; those not given are found by type and name.
+    :ivar left_out: why, for each odometry message that `events` has left out.
     :raises FileError: if there is no bag, or it is cut short, or a topic is missing or ambiguous.
     """
 
@@ -60,6 +61,7 @@ class BagReader:
         self._stack = ExitStack()
         self._reader: Any = None
         self.topics = self._wanted
+        self.left_out: list[str] = []
 
     def __enter__(self) -> BagReader:
         if not self.path.exists():
@@ -111,6 +113,8 @@ class BagReader:
     def events(self, odometry: bool = True, ground_truth: bool = False) -> Iterator[BagEvent]:
         """Images, and odometry and ground truth if wanted and there, by time of reception.
 
+        Odometry that is no pose is left out, as the node does.
+
         :raises FileError: if the bag has no image, or a message cannot be read.
         """
         names = [self._image_topic()]
@@ -123,9 +127,14 @@ class BagReader:
                     _stamp(message), received, message.header.frame_id, topic, message)
                 continue
             if topic == self.topics.odom and odometry:
+                try:
+                    pose = self._pose(topic, kind, message)
+                except FileError as error:
+                    self.left_out.append(str(error))
+                    continue
                 yield StampedOdometry(
                     _stamp(message), received, message.header.frame_id, message.child_frame_id,
-                    self._pose(topic, kind, message))
+                    pose)
             if topic == truth:
                 yield StampedTruth(
                     _stamp(message), received, message.header.frame_id,
