@@ -141,6 +141,14 @@ def test_other_hostile_messages_are_named(world, arena):
     assert user.insist(odom, drifting, lambda: refused(user, 'odom_pose')), node.output
     drifting.child_frame_id = 'wheel'
     assert user.insist(odom, drifting, lambda: refused(user, 'odom_frame')), node.output
+    leaping = Odometry(child_frame_id='base_link')
+    leaping.header.frame_id, leaping.pose.pose.orientation.w = 'odom', 1.0
+    for place in (0.0, 100.0):
+        leaping.header.stamp.nanosec += 10_000_000
+        leaping.pose.pose.position.x = place
+        odom.publish(leaping)
+    assert user.wait(lambda: refused(user, 'odom_jump')), node.output
+    assert '100 m and 0 rad' in user.value('localiser: images', 'last_refusal')
 
     # Another camera: poses are withheld, both numbers said, until the right one speaks.
     other = PinholeCamera(640, 480, 500.0, 375.0, 320.25, 238.5)
