@@ -81,10 +81,8 @@ class BandPredictor:
 
     def __init__(self, table: FloorTable, line_map: LineMap) -> None:
         self._table = table
-        self._lines = np.array([
-            k for k, line in enumerate(line_map)
-            if line.width > 0.0 and line.is_horizontal and abs(line.start[2]) < 1e-6],
-            dtype=np.intp)
+        self._lines = np.array(
+            [k for k, line in enumerate(line_map) if line.is_tape], dtype=np.intp)
         self._start = as_complex(line_map.starts[self._lines, :2])
         self._direction = as_complex(line_map.directions[self._lines, :2])
         self._length = line_map.lengths[self._lines]
