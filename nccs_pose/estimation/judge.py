@@ -64,6 +64,7 @@ _NEARLY_ALL = 0.85
 _WEAK_GATE = 3.0
 # A direction of the pose is open when its deviation exceeds this, metres and radians.
 OPEN = 0.5
+UNFIXED = Objection('the lines that it rests on do not fix a pose')
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +155,7 @@ class Judge:
             return against
         found = self.measured(alignment, segments, strips)
         if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
-            return Objection('the lines that it rests on do not fix a pose')
+            return UNFIXED
         used = lines_used(alignment)
         weaker, stronger = sorted((found.claimed, alignment.explained))
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)

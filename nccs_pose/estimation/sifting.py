@@ -25,7 +25,7 @@ from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge
+from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, UNFIXED
 from nccs_pose.estimation.ledger import AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
@@ -222,7 +222,8 @@ class Sifter:
                 sight.image, alignment, sight.segments, case.doubts, expected=expected,
                 strips=start.kept(alignment.pose))
             verdict = alignment, self._unless_doubtful(case, found, expected)
-            if isinstance(verdict[1], Found) or not alignment.missing:
+            if isinstance(verdict[1], Found) or not (
+                    alignment.missing or verdict[1] is UNFIXED):
                 break
         return verdict
 
