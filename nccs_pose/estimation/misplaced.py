@@ -30,7 +30,7 @@ from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.median import upper_median
-from nccs_pose.vision.profile_search import contrast_across
+from nccs_pose.vision.profile_search import contrast_across, overlap
 from nccs_pose.vision.profiles import fit_profiles
 import numpy as np
 from numpy.typing import NDArray
@@ -177,8 +177,14 @@ def _strongest(
     better, certain = _mean_and_deviation(here[best] - own, weight[best])
     if not max(_CONTRAST[0], _EVIDENT * noise) < level < _CONTRAST[1]:
         return None
-    if offset > _CAPTURED and better < max(_BETTER[0], _BETTER[1] * certain):
-        return None
+    if offset > _CAPTURED:
+        if better < max(_BETTER[0], _BETTER[1] * certain):
+            return None
+        # What is seen in its place, and is not the blur of what is beside it, is the line.
+        left = own - here[best] * overlap(bands, colour, shift[best])
+        level, noise = _mean_and_deviation(left, weight[best])
+        if level > max(_CONTRAST[0], _BETTER[1] * noise):
+            return None
     return shift[best]
 
 

@@ -72,14 +72,32 @@ def contrast_across(
     weights = colour.discriminant.astype(np.float32)
     feature = _sample(image, bands, s) @ weights
     k = np.arange(-kernel_half, kernel_half + 1.0) * step
-    wide = bands.half_width[:, None]
-    box = ndtr((k + wide) / colour.blur) - ndtr((k - wide) / colour.blur)
+    box = _blurred(k, bands, colour)
     box -= box.mean(axis=1, keepdims=True)
     power = np.maximum((box * box).sum(axis=1), 1e-9)
     box = (box / power[:, None]).astype(np.float32)
     windows = np.lib.stride_tricks.sliding_window_view(feature, len(k), axis=1)
     contrast = (windows @ box[:, :, None])[..., 0]
     return np.arange(-places, places + 1.0) * step, contrast, power
+
+
+def overlap(bands: Bands, colour: LineColour, shift: Array) -> Array:
+    """How much of a tape there seems to be in its place when it is so far beside it (N,).
+
+    :param shift: how far (N,), px.
+    """
+    side = 3.0 * colour.blur + float((np.abs(shift) + bands.half_width).max())
+    k = np.linspace(-side, side, 65)
+    here = _blurred(k, bands, colour)
+    here -= here.mean(axis=1, keepdims=True)
+    there = _blurred(k - shift[:, None], bands, colour)
+    return np.asarray((here * there).sum(axis=1) / np.maximum((here * here).sum(axis=1), 1e-9))
+
+
+def _blurred(at: Array, bands: Bands, colour: LineColour) -> Array:
+    """A tape's profile (N, K), 1 inside, at places (K,) or (N, K) across it, px."""
+    wide = bands.half_width[:, None]
+    return np.asarray(ndtr((at + wide) / colour.blur) - ndtr((at - wide) / colour.blur))
 
 
 def _sample(
