@@ -25,7 +25,7 @@ from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, UNFIXED
+from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, lines_shown, UNFIXED
 from nccs_pose.estimation.ledger import AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
@@ -47,8 +47,10 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.75
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
-# So does a pose that explains more than this of what should be seen and of what is.
+# So does a pose that explains more than this of what should be seen and of what is, or shows so
+# many lines that much of what should be seen is no chance: things may well lie beside them.
 _PLAINLY_ALL = 0.9
+_MANY_LINES = 4
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
@@ -267,7 +269,8 @@ class Sifter:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
+        many = len(lines_shown(alignment)) >= _MANY_LINES
+        if sharp or min(1.0 if many else found.claimed, alignment.explained) > _PLAINLY_ALL:
             return found
         if alignment.missing:
             return _INCOMPLETE
