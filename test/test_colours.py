@@ -28,7 +28,7 @@ import pytest
 
 FLOORS = {
     'grey': (0.30, 0.34, 0.36), 'wood': (0.16, 0.30, 0.44), 'green': (0.10, 0.30, 0.12),
-    'dark': (0.07, 0.08, 0.09), 'blue': (0.34, 0.20, 0.10)}
+    'dark': (0.07, 0.08, 0.09), 'blue': (0.34, 0.20, 0.10), 'light': (0.62, 0.65, 0.66)}
 # Blue, green and red gains, and exposure in stops.
 LIGHTS = {
     'neutral': ((0.94, 1.0, 1.05), 0.0), 'warm': ((0.7, 1.0, 1.3), 0.0),
@@ -50,14 +50,14 @@ def _scene(colours: tuple[str, ...], floor: str, light: str, width: int = 640) -
             scene.sensor, exposure=0.8 * 2.0**stops, white_balance=balance))
 
 
-def _pose(k: int) -> tuple[Pose2, np.random.Generator]:
-    rng = np.random.default_rng([7, k])
+def _pose(k: int, seed: int = 7) -> tuple[Pose2, np.random.Generator]:
+    rng = np.random.default_rng([seed, k])
     return Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.8, 0.5, np.pi)), rng
 
 
-def _found(localiser: Localiser, scene: Scene, k: int) -> bool:
+def _found(localiser: Localiser, scene: Scene, k: int, seed: int = 7) -> bool:
     """Whether a first image is answered; a wrong answer fails."""
-    pose, rng = _pose(k)
+    pose, rng = _pose(k, seed)
     localiser.reset()
     estimate = localiser.process(0, render(scene, pose, rng))
     if estimate.pose is None:
@@ -88,6 +88,22 @@ def test_tapes_of_nearly_the_floors_colour_are_found_where_there_is_light(
     scene = _scene(colours, floor, light)
     localiser = Localiser(scene.rig, scene.line_map)
     assert sum(_found(localiser, scene, k) for k in range(20)) >= 18
+
+
+@pytest.mark.parametrize('colour', ['green', 'blue'])
+def test_tapes_of_nearly_the_floors_colour_are_found_in_dim_light(colour: str) -> None:
+    scene = _scene((colour,) * 4, colour, 'dim')
+    localiser = Localiser(scene.rig, scene.line_map)
+    assert sum(_found(localiser, scene, k) for k in range(20)) >= 17
+
+
+@pytest.mark.parametrize(('colour', 'floor', 'k'), [('blue', 'blue', 52), ('white', 'light', 53)])
+def test_little_that_is_seen_in_dim_light_gives_no_other_place(
+        colour: str, floor: str, k: int) -> None:
+    # Two strips lie on two lines at a wrong pose too; and of one of two broad lines half is seen.
+    scene = _scene((colour,) * 4, floor, 'dim')
+    localiser = Localiser(scene.rig, scene.line_map)
+    _found(localiser, scene, k, 57)
 
 
 def test_an_image_so_small_that_one_tape_alone_is_wide_gives_no_other_place() -> None:

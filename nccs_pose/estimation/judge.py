@@ -50,10 +50,12 @@ _CLOSE = 4.0
 # rests on so many other lines that one of them would show.
 _BEYOND_DOUBT = 4
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
-# what is seen, one on three lines that of either; more lines speak for themselves.
+# what is seen, one on three lines that of either; more lines speak for themselves. Where one
+# is missing, fewer strips than this are no evidence: they lie on lines at any pose made of them.
 _MOST = 0.85
-# Out of nothing a pose must rest on two lines that are so wide in the image, px: thinner ones are
-# found on whatever is near, as the floor's edge.
+_LEAST_STRIPS = 3
+# Out of nothing a pose must rest on most of each of two lines that are so wide in the image, px:
+# thinner ones are found on whatever is near, as the floor's edge.
 _BROAD = 0.6
 # Residuals of this root mean square count half, px.
 _HALF_AS_GOOD = 1.0
@@ -158,10 +160,12 @@ class Judge:
             return UNFIXED
         used = lines_used(alignment)
         weaker, stronger = sorted((found.claimed, alignment.explained))
+        if alignment.missing and len(segments) < _LEAST_STRIPS:
+            stronger = alignment.explained
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
             return _unexplained(used)
-        broad = (alignment.support >= _WEAK) & (alignment.width >= _BROAD)
+        broad = (alignment.support > _WEAK) & (alignment.width >= _BROAD)
         if not expected and np.count_nonzero(broad) < 2:
             return Objection(
                 f'all but {np.count_nonzero(broad)} of the lines that it rests on are thinner '
