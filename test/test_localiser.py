@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 import itertools
 import math
+from pathlib import Path
 from typing import Any
 
 from nccs_pose.errors import FrameRefusedError, GeometryError
@@ -29,6 +30,7 @@ from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
@@ -226,6 +228,22 @@ def _hall_of_bays() -> tuple[Scene, Localiser]:
     look = replace(arena_scene(640).appearance, room=None, obstacles=())
     scene = replace(arena_scene(640), line_map=hall, appearance=look)
     return scene, Localiser(scene.rig, hall)
+
+
+def test_a_line_that_is_searched_fixes_what_two_parallel_ones_do_not(repository: Path) -> None:
+    # From where the strips put it the pose lies on two parallel lines at once, and the third that
+    # is in view is a few pixels off.
+    base = arena_scene(640)
+    scene = replace(
+        base, line_map=load_map(repository / 'config' / 'soccer_map.yaml'),
+        appearance=replace(base.appearance, room=None, obstacles=(), light_gradient=(0.0, 0.0)))
+    pose = Pose2(-5.39, 1.31, 2.98)
+    localiser = Localiser(scene.rig, scene.line_map)
+    for seed in (0, 3):
+        localiser.reset()
+        estimate = localiser.process(0, render(scene, pose, np.random.default_rng(seed)))
+        assert estimate.state is State.AMBIGUOUS
+        assert min(np.hypot(*c.pose.minus(pose)[:2]) for c in estimate.candidates) < 0.01
 
 
 def test_one_of_many_equal_places_is_never_taken_for_the_only_one() -> None:
