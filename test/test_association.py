@@ -264,6 +264,30 @@ def test_equal_places_are_told_alike_however_the_strips_lie(table: FloorTable) -
     assert (np.abs(told - np.median(told, axis=0)) < [0.01, 0.01, 0.005]).all()
 
 
+def test_where_a_map_nearly_looks_like_itself_an_askew_strip_hides_no_pose(
+    table: FloorTable,
+) -> None:
+    line_map = LineMap((
+        _line((-1.75, -1.30), (1.45, -1.42)), _line((1.92, -1.05), (1.78, 1.10)),
+        _line((1.20, 1.36), (-1.05, 1.22)), _line((-1.80, 0.95), (-1.93, -0.85))))
+    # Most of south and of north, and two pieces of east, bent by blocks of JPEG by 29 and 9 deg.
+    pose, strips = Pose2(0.325, -0.014, 2.116), []
+    for weight, footprint, ends in (
+            (692.0, 0.066, [[-1.5, 0.19], [-0.2, 2.25]]),
+            (688.0, 0.056, [[0.71, -1.52], [1.72, 0.48]]),
+            (148.0, 0.072, [[-1.04, -1.01], [-0.73, -1.49]]),
+            (120.0, 0.092, [[-1.26, -1.0], [-0.26, -1.75]])):
+        start, end = np.array(ends)
+        along = (end - start) / np.linalg.norm(end - start)
+        normal = np.array([-along[1], along[0]])
+        strips.append(FloorSegment(
+            normal, float(normal @ start), start, end, weight, footprint, np.zeros((0, 2)),
+            pitch=2))
+    candidates = Associator(line_map, table).candidates(tuple(strips)).fitted
+    off = np.abs([c.pose.minus(pose) for c in candidates])
+    assert (off < [0.1, 0.1, 0.05]).all(axis=1).any()
+
+
 def test_where_many_hundreds_of_places_are_equal_all_are_told(table: FloorTable) -> None:
     places = np.arange(21.0)
     line_map = LineMap((*(_line((0.0, y), (20.0, y)) for y in places),

@@ -27,10 +27,11 @@ from typing import NamedTuple
 
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_segments import FloorSegment
-from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses
+from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines, poses_of_pairs
 from nccs_pose.estimation.strip_scores import Place, StripScorer
+from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import FloorTable
@@ -44,6 +45,10 @@ _PAIRS = 15
 _CLOSE = 300
 _COARSE = 3
 _REFINED = 24
+# In a coarse image strips lie off their lines as if its pixels were so large on the floor, metres;
+# a map of which this part lies on itself as well as that looks much the same from two places.
+_ASKEW = 0.15
+_MUCH = 0.85
 # A pose that explains this part of the strips leaves none unexplained.
 ALL_STRIPS = 0.95
 _NONE = Poses(np.zeros(0, complex), np.zeros(0, complex))
@@ -84,6 +89,7 @@ class Associator:
     def __init__(self, line_map: LineMap, table: FloorTable) -> None:
         lines = FloorLines(line_map)
         self._place = Place(lines, NearestLines(lines), FloorScale(table))
+        self._alike = _likenesses(line_map, self._place)
         self._last: StripScorer | None = None
 
     def candidates(
@@ -109,6 +115,7 @@ class Associator:
         if len(poses.place) > _REFINED:
             poses, guessed, others = _promising(scorer, poses, told)
             rounds = 1
+        poses = poses.and_moved_by(self._alike)
         poses, claimed, misfit = scorer.refined(poses, rounds)
         score = _harmonic(claimed, scorer.explained(poses))
         found = distinct(poses, score)
@@ -135,6 +142,24 @@ class Associator:
         if self._last is None or self._last.segments is not segments:
             self._last = StripScorer(segments, self._place)
         return self._last
+
+
+def _likenesses(line_map: LineMap, place: Place) -> Poses:
+    """Motions of a map that lay its lines near to its lines, but for its symmetries.
+
+    A coarse image may be taken for one from there. Where they are many no pair of strips tells one
+    from another, and all are among the poses anyway.
+    """
+    tapes = tuple(FloorSegment(
+        np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
+        line.length, _ASKEW, np.zeros((0, 2)), line.colour) for line in line_map)
+    scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), place)
+    poses = Poses(*poses_of_pairs(scorer.strips, place.lines, _PAIRS))
+    if not 0 < len(poses.place) <= _CLOSE:
+        return _NONE
+    poses, claimed, _ = scorer.refined(poses, 4)
+    poses = poses[[k for k in distinct(poses, claimed) if claimed[k] > _MUCH]]
+    return poses[unlike(poses, Poses.of(map_symmetries(line_map)))]
 
 
 def _promising(
