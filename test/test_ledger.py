@@ -37,7 +37,7 @@ HERE, THERE, NOWHERE = Pose2(1.0, 0.0, 0.0), Pose2(4.0, 2.0, 1.0), Pose2(-3.0, 2
 
 
 def _alignment(pose: Pose2) -> Any:
-    return SimpleNamespace(pose=pose, support=np.ones(2), explained=0.5)
+    return SimpleNamespace(pose=pose, support=np.ones(2), explained=0.5, missing=())
 
 
 def _found(pose: Pose2, score: float, by_strips: float = 0.8) -> Found:
@@ -137,19 +137,34 @@ def test_a_pose_is_beaten_by_what_holds_unless_more_of_it_may_be_there() -> None
     assert not ledger.beats(_strips(THERE, 0.7, misfit=0.5))
     plain = _ledger((), None, ())
     plain.hold(replace(_found(HERE, 0.8), alignment=SimpleNamespace(
-        pose=HERE, support=np.ones(3), explained=1.0)), None)
+        pose=HERE, support=np.ones(3), explained=1.0, missing=())), None)
     assert plain.beats(_strips(THERE, 0.6, claimed=0.9))
     assert not plain.beats(_strips(THERE, 0.6, claimed=0.97))
 
 
-def test_a_doubtful_pose_is_open_only_beside_a_worse_one() -> None:
-    for best, opens in ((0.5, True), (0.9, False)):
+def test_a_doubtful_pose_is_open_only_beside_one_that_shows_no_more() -> None:
+    # How well the lines lie, which is the rest of a score, says little where there are doubts.
+    for shows, opens in ((0.7, True), (0.95, False)):
         ledger = _ledger((), None, ())
-        ledger.doubt(AWAY, _found(THERE, 0.6))
-        ledger.hold(_found(HERE, best), None)
+        ledger.doubt(AWAY, _found(THERE, 0.6, by_strips=0.6))
+        ledger.hold(_found(HERE, 0.3, by_strips=shows), None)
         sifted = ledger.closed()
         assert [c.pose for c in sifted.open] == ([THERE] if opens else [])
         assert [c.pose for c in sifted.hidden] == ([] if opens else [THERE])
+
+
+def test_a_pose_that_misses_lines_is_worth_no_more_than_one_that_misses_none() -> None:
+    ledger = _ledger((), None, ())
+    lacking = _found(THERE, 0.6)
+    lacking.alignment.missing = (2,)
+    ledger.hold(lacking, None)
+    assert [f.score for f in ledger.closed().held] == [0.6]
+    ledger.hold(_found(HERE, 0.2), None)
+    held = ledger.closed().held
+    assert [f.score for f in held] == [0.2, 0.2]
+    assert held[0].alignment.pose == HERE
+    ledger.hold(_found(NOWHERE, 0.7), None)
+    assert [f.score for f in ledger.closed().held] == [0.7, 0.6, 0.2]
 
 
 def test_the_best_is_first_and_tied_by_its_equals() -> None:
@@ -179,5 +194,5 @@ def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_op
         ledger = _ledger((), None, ())
         ledger.hold(_found(HERE, best), None)
         ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
-            pose=THERE, support=np.ones(lines), explained=1.0)))
+            pose=THERE, support=np.ones(lines), explained=1.0, missing=())))
         assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])

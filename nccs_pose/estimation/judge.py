@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Set
 from dataclasses import dataclass
+import math
 
 from nccs_pose.estimation.aligner import SPACING
 from nccs_pose.estimation.alignment import Alignment, close
@@ -83,6 +84,11 @@ class Found:
     claimed: float
     score: float
     by_strips: float = float('nan')
+
+    @property
+    def shown(self) -> float:
+        """How much it explains, however well its lines lie on the image, 0 to 1."""
+        return shown(self.by_strips, self.alignment)
 
 
 class Judge:
@@ -188,13 +194,18 @@ class Judge:
         score, claimed = (strips.score, strips.claimed) if strips is not None else (
             self._searcher.score(alignment.pose, segments))
         return Found(
-            alignment, claimed, float(np.sqrt(score * alignment.explained)) * fit_of(
+            alignment, claimed, shown(score, alignment) * fit_of(
                 float(np.mean(alignment.points.sigma**2))),
             score)
 
 
 def _unexplained(lines: int) -> Objection:
     return Objection(f'it rests on {lines} lines and leaves too much unexplained', hidden=True)
+
+
+def shown(by_strips: float, alignment: Alignment) -> float:
+    """How much a pose explains by strips and by the lines that should be seen, 0 to 1."""
+    return math.sqrt(by_strips * alignment.explained)
 
 
 def fit_of(square: float) -> float:

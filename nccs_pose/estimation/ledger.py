@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 from nccs_pose.estimation.alignment import Alignment
@@ -196,18 +196,18 @@ class Ledger:
 
     def closed(self) -> Sifted:
         """What is left when no more poses are laid on the image."""
-        held = sorted(self._held, key=lambda f: -f.score)
-        if self.best is None:
+        held = _ranked(self._held)
+        if not held:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
-        poses = [f.alignment.pose for f in held]
-        left_open = self._open(poses, self.best)
-        known, least = [*poses, *self._laid], self._ratio * self.best.by_strips
-        left_open += self._unlaid([c for c in self._left if c.score >= least], known, self.best)
+        best, poses = held[0], [f.alignment.pose for f in held]
+        left_open = self._open(poses, best)
+        known, least = [*poses, *self._laid], self._ratio * best.by_strips
+        left_open += self._unlaid([c for c in self._left if c.score >= least], known, best)
         # More of the lines of what explains the same strips may be there than they show.
         rest = self._unlaid(
             [c for c in (*self._left, *self._passed_over)
-             if c.claimed > self.best.claimed - AS_MUCH],
-            [*known, *(c.pose for c in left_open)], self.best)
+             if c.claimed > best.claimed - AS_MUCH],
+            [*known, *(c.pose for c in left_open)], best)
         others = self._others
         if len(others.place) > 0:
             others = others[unlike(others, Poses.of(known))]
@@ -233,7 +233,8 @@ class Ledger:
                  if explains_nearly_all(excused) and excused.score > best.score]
         for doubtful in self._doubtful:
             pose = doubtful.alignment.pose
-            if doubtful.score >= self._ratio * best.score:
+            # How well its lines lie says little on an image that leaves such doubts.
+            if doubtful.shown >= self._ratio * best.shown:
                 found.append(Candidate(pose, min(doubtful.score, best.score)))
             else:
                 self._hidden.append(Candidate(pose, doubtful.by_strips))
@@ -257,3 +258,14 @@ class Ledger:
             Candidate(
                 strips.pose @ self._moved, min(strips.score / best.by_strips, 1.0) * best.score)
             for strips, differs in zip(left, new.tolist()) if differs]
+
+
+def _ranked(held: list[Found]) -> list[Found]:
+    """Poses that hold, best first.
+
+    One that misses lines is worth no more than one that misses none, as well as the others lie:
+    those that lie badly may be among what it does without.
+    """
+    most = max((f.score for f in held if not f.alignment.missing), default=1.0)
+    capped = [replace(f, score=min(f.score, most)) if f.alignment.missing else f for f in held]
+    return sorted(capped, key=lambda f: (-f.score, len(f.alignment.missing)))

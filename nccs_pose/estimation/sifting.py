@@ -25,7 +25,7 @@ from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, lines_shown, UNFIXED
+from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, shown, UNFIXED
 from nccs_pose.estimation.ledger import AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
@@ -47,14 +47,13 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.75
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
-# So does a pose that explains more than this of what should be seen and of what is, or shows so
-# many lines that much of what should be seen is no chance: things may well lie beside them.
+# So does a pose that explains more than this of what should be seen and of what is.
 _PLAINLY_ALL = 0.9
-_MANY_LINES = 4
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
+
 _INCOMPLETE = Objection(
     'its lines lie badly on the image, and others that should be in view are not there',
     hidden=True)
@@ -260,24 +259,32 @@ class Sifter:
     ) -> Found | Objection:
         """A verdict, unless the strips speak as much for another pose, and the image for neither.
 
-        An image so coarse that lines lie badly on it is no verdict on another pose: the right one
-        may not be laid on it at all, and the next may be. Nor need it be among the candidates,
-        since strips lie askew on such an image: a pose has to show all the lines that should be in
-        view. Where it decides nothing there is no doubt.
+        On an image so coarse that lines lie badly on it how well they lie says little, and what a
+        pose shows of strips and lines has to stand out among those that lie on it. Nor need the
+        right one be among the candidates, since strips lie askew: a pose has to show all the lines
+        that should be in view. Where the image decides nothing there is no doubt.
         """
         if isinstance(found, Objection) or expected:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
         sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        many = len(lines_shown(alignment)) >= _MANY_LINES
-        if sharp or min(1.0 if many else found.claimed, alignment.explained) > _PLAINLY_ALL:
+        if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
             return found
         if alignment.missing:
             return _INCOMPLETE
         if case.told is None and self._has_many_equals(found, candidates):
             return found
         least = self._options.ambiguity_ratio * found.by_strips
-        rivals = any(
-            c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
-                c.pose, alignment.pose) for c in candidates)
-        return _DOUBTFUL if rivals else found
+        rivals = (
+            c for c in candidates
+            if c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
+                c.pose, alignment.pose))
+        doubted = any(self._shows_as_much(case, rival, found) for rival in rivals)
+        return _DOUBTFUL if doubted else found
+
+    def _shows_as_much(self, case: Case, rival: FittedCandidate, found: Found) -> bool:
+        """Whether a candidate shows about as much, laid on the image, as a pose that holds."""
+        alignment = self._aligner.align(
+            case.sight.image, rival.pose, case.sight.colours, reach=_SEARCH_BAND)
+        return alignment is not None and shown(
+            rival.score, alignment) >= self._options.ambiguity_ratio * found.shown
