@@ -53,7 +53,6 @@ _PLAINLY_ALL = 0.9
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
-
 _INCOMPLETE = Objection(
     'its lines lie badly on the image, and others that should be in view are not there',
     hidden=True)
