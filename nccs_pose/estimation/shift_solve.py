@@ -34,15 +34,10 @@ from numpy.typing import NDArray
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
-# Beyond this many robust standard deviations a group of stations is no inlier.
+# Beyond this many robust standard deviations a station is no inlier; what lies within has this
+# much of a Gaussian's variance.
 _GATE = 3.0
-# The density at the gate is told by the groups from 2.6 to 3.6 deviations, one deviation whose
-# mean density is a Gaussian's at the gate; and by so many groups more that are taken for Gaussian,
-# of which this part would be there. A fit is held by this much at least.
-_BY_GATE = np.square([2.6, _GATE, 3.6])
-_TOLD = 10.0
-_GAUSSIAN_BY_GATE = 0.009
-_LEAST_HELD = 0.3
+_WITHIN_GATE = 0.9733
 _ITERATIONS = 8
 # The robust stage only has to find the inliers. After a step below this, in squared deviations of
 # the pose, the next is about a fifth of it, and moves no group's residual by as much as a tenth of
@@ -92,23 +87,24 @@ def solve_shifts(
     np.divide(shift, sigma, out=rows[-1])
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
-    square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
-    inlier = (square <= _GATE**2).repeat(members)
-    # What is refused says nothing: neither that there is an error nor that there is none.
-    inliers = rows * inlier
+    unknowns, trusted = _robust(
+        np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
+    inlier = trusted.repeat(members)
+    at, = inlier.nonzero()
+    inliers = rows.take(at, axis=1)
     squares = inliers.dot(inliers.T)
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
+    e = _residual(inliers, unknowns)
     one = _ONE[:len(free), :len(free)]
-    fitted = definite_solution(normal + known, one)
-    e = _residual(inliers, fitted.dot(right + told))
-    leverage = (fitted.dot(inliers[:-1]) * inliers[:-1]).sum(axis=0)
-    inflation = max(common_variance(e, leverage, label, first) / _held(square) ** 2, 1e-6)
+    leverage = (
+        definite_solution(normal + known, one).dot(inliers[:-1]) * inliers[:-1]).sum(axis=0)
+    inflation = max(common_variance(e, leverage, label.take(at)) / _WITHIN_GATE, 1e-6)
     covariance = definite_solution(normal / inflation + known, one)
     unknowns = covariance @ (right / inflation + told)
     if calibration_sigma > 0.0 and image_shift is not None:
-        answer = covariance @ (inliers[:-1] @ (image_shift / sigma[:, None])) * (
-            calibration_sigma / inflation)
+        moved = image_shift[inlier] / sigma[inlier, None]
+        answer = covariance @ (inliers[:-1] @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     step = np.zeros(6)
     step[free] = unknowns
@@ -119,13 +115,15 @@ def solve_shifts(
         _residual(rows, unknowns), inlier, True)
 
 
-def _robust(equations: Array, known: Array, told: Array) -> Array:
+def _robust(
+    equations: Array, known: Array, told: Array,
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Re-weighted least squares under Cauchy's loss.
 
     :param equations: whitened, by unknowns and what they should come to (K + 1, G).
     :param known: information about the unknowns beforehand (K, K), and times what they are
         expected to be, ``told`` (K,).
-    :returns: squares of the equations' residuals, in those of robust standard deviations (G,).
+    :returns: the unknowns (K,), and which equations are inliers (G,).
     """
     unknowns: NDArray[np.floating] = np.zeros(len(told))
     e = equations[-1]
@@ -141,24 +139,8 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
         step = unknowns - before
         if step.dot(normal).dot(step) < _FOUND:
             break
-    square = np.square(e, dtype=float)
-    square /= _robust_variance(square)
-    return square
-
-
-def _held(square: Array) -> float:
-    """How firmly a fit to the inliers is held where it is, as a part of one without a gate.
-
-    As the fit moves, errors leave through the gate on one side and come in on the other, which
-    pulls it on: an error moves it 1 / (1 - s) times as far as it would without a gate, with s the
-    density of errors at the gate, of both signs, times the gate. So the variance of an M-estimate
-    is E psi^2 / (E psi')^2, and psi falls at the gate.
-
-    :param square: of the groups' residuals, in those of robust standard deviations (G,).
-    """
-    low, inliers, high = np.sort(square).searchsorted(_BY_GATE).tolist()
-    density = (high - low + _GAUSSIAN_BY_GATE * _TOLD) / (inliers + _TOLD)
-    return max(1.0 - _GATE * density, _LEAST_HELD)
+    square = e * e
+    return unknowns, square <= _GATE**2 * _robust_variance(square)
 
 
 def _prior(
