@@ -111,17 +111,30 @@ class Associator:
             return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []
         others = _NONE
-        rounds = 2
         if len(poses.place) > _REFINED:
             poses, guessed, others = _promising(scorer, poses, told)
-            rounds = 1
-        poses = poses.and_moved_by(self._alike)
-        poses, claimed, misfit = scorer.refined(poses, rounds)
+            poses, claimed, misfit = scorer.refined(poses, 1)
+        else:
+            poses, claimed, misfit = self._with_likenesses(scorer, poses)
         score = _harmonic(claimed, scorer.explained(poses))
         found = distinct(poses, score)
         refined = [FittedCandidate(*of) for of in zip(
             poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
         return Candidates(tuple(sorted((*refined, *guessed), key=lambda c: -c.score)), others)
+
+    def _with_likenesses(
+        self, scorer: StripScorer, poses: Poses,
+    ) -> tuple[Poses, Array, Array]:
+        """Poses laid on the strips, and those that they may be taken for, if these lie as well.
+
+        :returns: as of :meth:`.StripScorer.refined`.
+        """
+        count = len(poses.place)
+        poses, claimed, misfit = scorer.refined(poses.and_moved_by(self._alike), 2)
+        own = np.resize(misfit[:count], len(misfit))
+        well = (misfit <= own) & (claimed > 0.0)
+        well[:count] = True
+        return poses[well], claimed[well], misfit[well]
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
         """The score that a pose would have among the candidates, and the strips' part in it.
