@@ -21,12 +21,12 @@ import dataclasses
 from pathlib import Path
 import sys
 
+from nccs_pose.argument_types import whole
 from nccs_pose.calibration.from_images import calibrate_images
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.outline import find_outline
 from nccs_pose.calibration.procedure import Calibration
 from nccs_pose.calibration.rim import rig_from_outline
-from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import OptionError
 from nccs_pose.files.pictures import save_figure

@@ -19,11 +19,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from nccs_pose.argument_types import whole
 from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
 from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
 from nccs_pose.calibration.parameters import RigModel
-from nccs_pose.cli.argument_types import whole
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
 from nccs_pose.files.yaml_files import load_map, load_rig

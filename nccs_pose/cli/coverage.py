@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from nccs_pose.cli.argument_types import whole
+from nccs_pose.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.coverage import coverage_table, run_scenario, Scenario, SCENARIOS

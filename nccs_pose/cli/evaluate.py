@@ -19,7 +19,7 @@ import argparse
 import json
 from pathlib import Path
 
-from nccs_pose.cli.argument_types import seconds
+from nccs_pose.argument_types import seconds
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.tables import as_numbers, summary_table

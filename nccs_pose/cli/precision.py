@@ -21,7 +21,7 @@ import argparse
 import json
 from pathlib import Path
 
-from nccs_pose.cli.argument_types import whole
+from nccs_pose.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.precision import as_numbers, precision_table, run_precision
 from nccs_pose.files.text_files import write_text

@@ -19,7 +19,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from nccs_pose.cli.argument_types import whole
+from nccs_pose.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
 from nccs_pose.files.bags import BagWriter

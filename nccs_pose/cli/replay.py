@@ -24,7 +24,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from nccs_pose.cli.argument_types import whole
+from nccs_pose.argument_types import whole
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.offline_run import (
     answered_poses,

@@ -33,6 +33,7 @@ import threading
 import time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nccs_pose.argument_types import positive
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.plots import error_figure, trajectory_figure
@@ -46,7 +47,7 @@ from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_ns
-from nccs_pose.ros.player import Playback, Player, positive, wait_for_subscribers
+from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise
 from nccs_pose.ros.transport import use_large_images

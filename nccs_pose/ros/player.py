@@ -20,10 +20,10 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import importlib
-import math
 import sys
 import time
 
+from nccs_pose.argument_types import positive, seconds
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
@@ -217,40 +217,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('bag', help='folder of the bag')
     parser.add_argument('--rate', type=positive, default=1.0, help='speed factor (default 1)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
-    parser.add_argument('--start-offset', type=_seconds, default=0.0, metavar='S',
+    parser.add_argument('--start-offset', type=seconds, default=0.0, metavar='S',
                         help='seconds of the bag to leave out')
     parser.add_argument('--clock', action='store_true', help='publish /clock, for use_sim_time')
     parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='only these topics')
     parser.add_argument('--wait-for', nargs='+', metavar='TOPIC',
                         help='start when these topics have a subscriber')
-    parser.add_argument('--wait-timeout', type=_seconds, default=20.0, metavar='S',
+    parser.add_argument('--wait-timeout', type=seconds, default=20.0, metavar='S',
                         help='how long to wait for them (default 20)')
     return parser
-
-
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f'{text!r} is no number')
-    return value
-
-
-def positive(text: str) -> float:
-    """A number above 0, of the command line."""
-    value = _number(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f'{text} must be greater than 0')
-    return value
-
-
-def _seconds(text: str) -> float:
-    value = _number(text)
-    if value < 0.0:
-        raise argparse.ArgumentTypeError(f'{text} must not be negative')
-    return value
 
 
 if __name__ == '__main__':

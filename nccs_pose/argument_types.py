@@ -11,6 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
+
 """Numbers on the command line that must lie in a range; argparse says so where they do not."""
 
 from __future__ import annotations
@@ -35,12 +36,24 @@ def whole(low: int, high: int | None = None) -> Callable[[str], int]:
     return parse
 
 
+def positive(text: str) -> float:
+    """A number above 0."""
+    value = _number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} must be greater than 0')
+    return value
+
+
 def seconds(text: str) -> float:
     """A time, 0 or longer."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f'{text!r} is no time in seconds, 0 or longer')
     return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
