@@ -36,7 +36,10 @@ _MOST_ACROSS = 31
 def read_pixels(
     image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The pixels nearest to a grid over each band: values (N, P, 3) and place across s (N, P), px.
+    """The pixels nearest to a grid over each band: values (P, N, 3) and place across s (P, N), px.
+
+    All stations are read at one place of the grid before the next: what they show lies apart, so
+    that the processor fetches it for several at a time.
 
     :param margin: beyond the edges, px.
     :param rows: of the grid along each station's piece of curve.
@@ -48,39 +51,36 @@ def read_pixels(
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
     bend, length = 0.5 * bands.bend, bands.spacing * across
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
-    terms = np.empty((len(bands), 5), np.complex64)
-    terms[:, 0] = bands.centre.view(np.complex128)[:, 0]
-    terms[:, 1] = half_band * across
-    terms[:, 2] = -1j * length
-    terms[:, 3] = bend * bands.spacing * length
-    np.conjugate(across, out=terms[:, 4], casting='same_kind')
-    pixels = terms.view(np.float32)[:, :8] @ _grid(rows, k)
+    terms = np.empty((4, len(bands)), np.complex64)
+    terms[0] = bands.centre.view(np.complex128)[:, 0]
+    terms[1] = half_band * across
+    terms[2] = -1j * length
+    terms[3] = bend * bands.spacing * length
+    # Real factors act on real and imaginary parts alike.
+    pixels = _grid(rows, k) @ terms.view(np.float32)
     np.rint(pixels, out=pixels)
-    values = cv2.remap(image, pixels.reshape(len(bands), -1, 2), None, cv2.INTER_NEAREST,
+    values = cv2.remap(image, pixels.reshape(-1, len(bands), 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
     at = pixels.view(np.complex64)
-    at -= terms[:, :1]
-    at *= terms[:, 4:]
+    at -= terms[0]
+    at *= across.conj().astype(np.complex64)
     s = np.square(at.imag)
-    s *= bend.astype(np.float32)[:, None]
+    s *= bend.astype(np.float32)
     return values, np.subtract(at.real, s, out=s)
 
 
 @cache
 def _grid(rows: int, count: int) -> NDArray[np.float32]:
-    """1, places across from -1 to 1, along from -1/2 to 1/2, and their squares.
-
-    Each for the real and for the imaginary part of a complex factor, in turns: quicker than a
-    product of complex matrices (8, rows x count x 2).
+    """1, places across from -1 to 1, along from -1/2 to 1/2, and their squares (P, 4).
 
     :param rows: of places along, in the middles of equal parts.
     :param count: of places across.
     """
     along, across = np.meshgrid(
         (np.arange(rows) + 0.5) / rows - 0.5, np.linspace(-1.0, 1.0, count), indexing='ij')
-    return np.kron(np.stack([
-        np.ones(rows * count), across.ravel(), along.ravel(), np.square(along.ravel()),
-    ]), np.eye(2)).astype(np.float32)
+    return np.stack(
+        [np.ones_like(along), across, along, np.square(along)], axis=-1,
+    ).reshape(-1, 4).astype(np.float32)
 
 
 def as_complex(points: Array) -> NDArray[np.complex64]:
@@ -98,19 +98,19 @@ def profile_products(
     is the profile, D = dT/d(delta) and B = dT/d(blur), both times sqrt(2 pi) blur: for shifts and
     changes of the blur in :func:`unit`; s counts in blurs.
 
-    :param pixels: (N, P, 3) BGR.
-    :param s: their place across the curve (N, P), px.
+    :param pixels: (P, N, 3) BGR.
+    :param s: their place across the curve (P, N), px.
     :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
         over each group (7, 8, G); those with D of each station (8, N); and the colour (3,) that
         the channels are less, about that of the floor.
     """
-    n, count = s.shape
+    count, n = s.shape
     rows = np.empty((8, n, count), np.float32)
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(s, 1.0 / blur, out=place)
+    np.multiply(s.T, 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
@@ -130,7 +130,7 @@ def profile_products(
     np.subtract(square[1], square[0], out=rows[1])
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
     less = pixels[0, 0].astype(np.float32)
-    np.subtract(pixels.transpose(2, 0, 1), less[:, None, None], out=rows[4:7])
+    np.subtract(pixels.T, less[:, None, None], out=rows[4:7])
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     grouped = rows.reshape(8, -1, members * count)

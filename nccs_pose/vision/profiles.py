@@ -95,7 +95,7 @@ def fit_profiles(
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
     pixels, s = read_pixels(image, bands, margin, rows)
     pooled, by_shift, less = profile_products(pixels, s, bands.half_width, blur, bands.members)
-    count = s.shape[1]
+    count = len(s)
     system = _eliminated(pooled, bands.members * count)
     if not rough:
         floor = less + system.floor.sum(axis=1) / system.floor.shape[1]
