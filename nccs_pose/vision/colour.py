@@ -16,8 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import VisionError
@@ -61,12 +60,20 @@ class LineColour:
     :ivar contrast: tape minus floor (3,) in B, G, R, grey levels.
     :ivar clutter: covariance (3, 3) of what is no tape: noise, texture, shade; grey levels^2.
     :ivar blur: standard deviation of an edge's blur by lens, motion and pixel, px.
+    :ivar discriminant: Fisher's weights (3,) on B, G, R, scaled so that the contrast is 1.
     """
 
     name: str
     contrast: Array
     clutter: Array
     blur: float
+    discriminant: Array
+
+    @classmethod
+    def of(cls, name: str, contrast: Array, clutter: Array, blur: float) -> LineColour:
+        """A contrast (3,) that is told from clutter (3, 3)."""
+        weights = solution(clutter, contrast)
+        return cls(name, contrast, clutter, blur, weights / float(weights.dot(contrast)))
 
     @classmethod
     def nominal(cls, name: str, blur: float) -> LineColour:
@@ -80,14 +87,8 @@ class LineColour:
         # A coloured tape is told by chromaticity: brightness is what the floor varies in.
         coloured = abs(direction.sum()) < 1e-9
         grey = np.full((3, 3), 20.0**2) if coloured else np.zeros((3, 3))
-        return cls(name, _UNSEEN * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3),
-                   blur)
-
-    @cached_property
-    def discriminant(self) -> Array:
-        """Fisher's weights (3,) on B, G, R, scaled so that the tape's contrast is 1."""
-        weights = solution(self.clutter, self.contrast)
-        return weights / float(weights.dot(self.contrast))
+        return cls.of(
+            name, _UNSEEN * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3), blur)
 
     def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over the contrast seen at N stations and the variation that is no tape's.
@@ -122,7 +123,7 @@ class LineColour:
         """
         if self._unlike(contrast, floor) or float(contrast.dot(contrast)) < _LEAST_CONTRAST**2:
             return self
-        return LineColour(self.name, contrast, clutter + _ROUNDING, self.blur)
+        return LineColour.of(self.name, contrast, clutter + _ROUNDING, self.blur)
 
     def _unlike(self, contrast: Array, floor: Array) -> bool:
         """Whether a contrast (3,) to a floor's colour (3,) is another class's.
@@ -160,4 +161,6 @@ class LineColour:
             return self
         step = min(max(unit * float(height.dot(left)) / total, -_BLUR_STEP), _BLUR_STEP)
         least, most = _BLUR_RANGE
-        return replace(self, blur=min(max(self.blur + step, least), most))
+        return LineColour(
+            self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most),
+            self.discriminant)
