@@ -92,7 +92,8 @@ class Aligner:
         :param image: (H, W, 3) uint8 BGR.
         :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
             are searched first; 0 is for a start that is most likely right.
-        :param prior: carries the directions that the lines in view do not fix.
+        :param prior: a pose with its information (3, 3): carries the directions that the lines in
+            view do not fix.
         :param hopeless: whether a pose that will not move any further is refused in any case: one
             that is comes back as it is, before it has settled.
         :returns: None where too little of what the start predicts is found, or where the poses do

@@ -63,7 +63,7 @@ class Follower:
         :param image: (H, W, 3) uint8 BGR.
         :param doubts: lines that were seen beside their place and not in it since.
         """
-        prior = (prediction.pose, prediction.covariance)
+        prior = (prediction.pose, prediction.information)
         refused = Refused()
         for reach in (0.0, self._options.band):
             alignment = self._aligner.align(

@@ -84,6 +84,11 @@ class Prediction:
         """What the image is held against (3, 3): never so narrow that it would rule the image."""
         return self.carried + FLOOR
 
+    @cached_property
+    def information(self) -> Array:
+        """The inverse of :attr:`covariance`."""
+        return inverse(self.covariance)
+
     def without_floor(self, covariance: Array, solved: Array) -> Array:
         """A covariance (3, 3) after the image, with what the floor brought in taken out again.
 
@@ -91,12 +96,11 @@ class Prediction:
         the image says nothing, W is 1, and what is left of the pose's error is the carried one.
 
         :param covariance: of the pose: a multiple of the solve's, and more.
-        :param solved: of the solve, which had :attr:`covariance` as its prior.
+        :param solved: of the solve, which had this as its prior.
         """
-        prior = self.covariance
-        gain = solved.dot(inverse(prior))
+        gain = solved.dot(self.information)
         multiple = max(1.0, float(covariance.trace() / solved.trace()))
-        narrowed = covariance - gain.dot(multiple * prior - self.carried).dot(gain.T)
+        narrowed = covariance - gain.dot(multiple * self.covariance - self.carried).dot(gain.T)
         return covariance if inverse_3x3(narrowed) is None else narrowed
 
 

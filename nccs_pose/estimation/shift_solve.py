@@ -26,7 +26,7 @@ from functools import cache
 from nccs_pose.estimation.common_errors import common_variance
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.small_matrices import definite_solution, inverse
+from nccs_pose.geometry.small_matrices import definite_solution
 from nccs_pose.vision.bands import runs
 from nccs_pose.vision.median import upper_median
 import numpy as np
@@ -75,7 +75,7 @@ def solve_shifts(
     :param group: of neighbours that each belongs to (N,), those of a group together.
     :param label: map line of each (N,), ascending, along each line in order.
     :param start: the predicted pose, T_map_base.
-    :param prior: a pose with its covariance (3, 3), weighed in like a measurement.
+    :param prior: a pose with its information (3, 3), weighed in like a measurement.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held.
     :param image_shift: d(shift)/d(u, v) of the whole image (N, 2).
@@ -153,9 +153,9 @@ def _prior(
     free, vague = _unknowns(*attitude_sigma)
     information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
-        known = inverse(prior[1])
+        pose, known = prior
         information[:3, :3] += known
-        told[:3] = known.dot(prior[0].minus(start))
+        told[:3] = known.dot(pose.minus(start))
     return free, information, told
 
 
