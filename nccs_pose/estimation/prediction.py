@@ -134,9 +134,8 @@ class BandPredictor:
         apart = [each / max(n, 1) for each, n in zip(length, count)]
         first = itertools.accumulate(count, initial=0)
         before = [a + _END - n * each for a, n, each in zip(begin, first, apart)]
-        times = np.array(count, dtype=np.intp)
-        number = np.arange(tapes).repeat(times)
-        spacing_px, offset = np.array([apart, before]).repeat(times, axis=1)
+        number = np.arange(tapes).repeat(count)
+        spacing_px, offset = np.array([apart, before]).take(number, axis=1)
         where = np.arange(0.5, len(number)) * spacing_px + offset
         distance = np.interp(where, axis + self._slope, self._distance)
         return Places(number, distance, spacing_px, members)
@@ -155,14 +154,14 @@ class BandPredictor:
         number, distance = places.number, places.distance
         turn = _turned_back(pose)
         origin = (self._start - complex(pose.x, pose.y)) * turn
-        turns = self._powers.take(number, axis=1)
-        ahead = turn * turns[1]
+        turns = (self._powers * (turn ** _TURNS)[:, None]).take(number, axis=1)
+        ahead = turns[1]
         middle = origin.take(number) + distance * ahead
         if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
         image = self._table.expand(middle)
         # How the pixel goes as the point goes ahead on the line, and to its left.
-        along = (_TO_LINE * turn ** _TURNS).dot(image.terms * turns)
+        along = _TO_LINE.dot(image.terms * turns)
         pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left, beside = along
         speed = np.abs(by_ahead)
         turned, bent = along[2:4] / by_ahead

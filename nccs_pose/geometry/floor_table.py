@@ -119,7 +119,7 @@ class FloorTable:
         cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
         place: Complex = cells + 1j * cells[:, None]
         inside = 1.0 - np.abs(place) ** 2
-        ends = self.reach / self._stretch(np.array(self.reach)) + _MARGIN
+        ends = self.reach / self._stretch(np.array(self.reach**2)) + _MARGIN
         known = (np.abs(place) < ends) & (inside > 0.0)
         inside[~known] = np.nan
         # What is not known is not a number, nor are derivatives next to it.
@@ -220,17 +220,20 @@ class FloorTable:
     def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
         """The nearest knots to points (N, 9), see :meth:`_forward`, and the way from them (N,)."""
         offset = points - self._foot
-        place = as_points(offset * (_CELLS / self._stretch(np.abs(offset))))
+        square = np.square(offset.real) + np.square(offset.imag)
+        place = as_points(offset * (_CELLS / self._stretch(square)))
         at = np.rint(place).dot(_KNOTS_APART) + _MIDDLE_KNOT
         knots = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
         return knots, offset - knots[:, 6]
 
-    def _stretch(self, distance: Array) -> Array:
-        """How many metres of the floor, so far from the foot, one of the stereographic plane is.
+    def _stretch(self, square: Array) -> Array:
+        """How many metres of the floor one of the stereographic plane is.
 
         Infinity comes to lie on its unit circle.
+
+        :param square: of the distance from the foot, square metres.
         """
-        return self.height + np.hypot(distance, self.height)
+        return self.height + np.sqrt(square + self.height**2)
 
     def _backward(self) -> tuple[Array, NDArray[np.bool_]]:
         """Ground points on a coarse grid of pixels, and 1 where there is one."""

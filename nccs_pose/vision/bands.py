@@ -61,7 +61,8 @@ class Bands:
 
 def runs(number: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first member and the length of every run of equal numbers (R,), among N > 0."""
-    edge = np.ones(len(number) + 1, dtype=bool)
+    edge = np.empty(len(number) + 1, dtype=bool)
+    edge[0] = edge[-1] = True
     np.not_equal(number[1:], number[:-1], out=edge[1:-1])
     at = edge.nonzero()[0]
     return at[:-1], at[1:] - at[:-1]

@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 
 def upper_median(values: NDArray[Any]) -> float:
     """The middle one of values of any shape, the upper of two."""
-    middle = values.size // 2
-    return float(np.partition(values.ravel(), middle)[middle])
+    ordered, middle = values.flatten(), values.size // 2
+    ordered.partition(middle)
+    return float(ordered[middle])
