@@ -66,7 +66,7 @@ def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -
     variance = max(_square(weighed) / (fitted * max(1.0 - taken, 1e-12)), 1e-12)
     shown = 0.0
     for lag in range(1, _LAGS + 1):
-        along = label[lag:] == label[:-lag]
+        along = (label[lag:] == label[:-lag]).astype(float)
         products = float((weighed[lag:] * weighed[:-lag]).dot(along))
         shown += products / max(float(leverage[lag:].dot(along)), 1e-12) / variance
     taken *= _LAGS * (1.0 + _UNCERTAIN / fitted)

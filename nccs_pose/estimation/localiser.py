@@ -178,15 +178,13 @@ class Localiser:
         self._now = self._odometry.at(stamp_ns)
         prediction = self._predict(stamp_ns)
         watch.lap('predict')
-        refused = Refused()
-        if prediction is not None:
-            followed = self._follower.follow(
-                image, prediction, self._colours, self._doubts, watch)
-            if isinstance(followed, Found):
-                return self._tracking(
-                    stamp_ns, followed, prediction, watch, 'the pose explains the image')
-            refused = followed
-        return self._search(stamp_ns, image, prediction, refused, watch)
+        if prediction is None:
+            return self._search(stamp_ns, image, None, Refused(), watch)
+        followed = self._follower.follow(image, prediction, self._colours, self._doubts, watch)
+        if isinstance(followed, Found):
+            return self._tracking(
+                stamp_ns, followed, prediction, watch, 'the pose explains the image')
+        return self._search(stamp_ns, image, prediction, followed, watch)
 
     def _predict(self, stamp_ns: int) -> Prediction | None:
         track, before = self._track, self._before

@@ -106,7 +106,7 @@ class FloorTable:
         self._sees_floor = np.pad(cells, 1)
         self._beyond = np.array(cells.shape[::-1]) + 1.0
         # From one cell to the next, right and down.
-        self._apart = np.array([1, cells.shape[1] + 2])
+        self._apart = np.array([1.0, cells.shape[1] + 2.0])
         self._knots = self._forward()
 
     def _forward(self) -> Complex:
@@ -265,9 +265,9 @@ class FloorTable:
         """Whether pixels (N, 2) lie in the image where it shows the floor within reach (N,)."""
         # Of the nearest pixel, in cells after the frame's corner.
         at = pixels * (1.0 / _STRIDE) + (1.0 + 0.5 / _STRIDE)
-        cell = np.minimum(np.maximum(at, 0.0), self._beyond).astype(np.intp)
+        cell = np.floor(np.minimum(np.maximum(at, 0.0), self._beyond)).dot(self._apart)
         # What is not a number becomes an index far from all others, and is taken for a corner.
-        return self._sees_floor.take(cell.dot(self._apart), mode='clip')
+        return self._sees_floor.take(cell.astype(np.intp), mode='clip')
 
     def floor(self, pixels: Array) -> tuple[Array, Array]:
         """Ground points (N, 2) of pixels in :attr:`region`, and d(point)/d(u, v) (N, 2, 2).

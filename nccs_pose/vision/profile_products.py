@@ -51,19 +51,17 @@ def read_pixels(
     k = min(math.ceil(2.0 * float(half_band.max())) + 1, _MOST_ACROSS)
     bend, length = 0.5 * bands.bend, bands.spacing * across
     # The station's bit of curve is a parabola: c + t s + n k s^2 / 2.
-    terms = np.empty((4, len(bands)), np.complex64)
-    terms[0] = bands.centre.view(np.complex128)[:, 0]
-    terms[1] = half_band * across
-    terms[2] = -1j * length
-    terms[3] = bend * bands.spacing * length
+    terms = np.array([
+        bands.centre.view(np.complex128)[:, 0], half_band * across, -1j * length,
+        bend * bands.spacing * length, across.conj()], dtype=np.complex64)
     # Real factors act on real and imaginary parts alike.
-    pixels = _grid(rows, k) @ terms.view(np.float32)
+    pixels = _grid(rows, k) @ terms[:4].view(np.float32)
     np.rint(pixels, out=pixels)
     values = cv2.remap(image, pixels.reshape(-1, len(bands), 2), None, cv2.INTER_NEAREST,
                        borderMode=cv2.BORDER_REPLICATE)
     at = pixels.view(np.complex64)
     at -= terms[0]
-    at *= across.conj().astype(np.complex64)
+    at *= terms[4]
     s = np.square(at.imag)
     s *= bend.astype(np.float32)
     return values, np.subtract(at.real, s, out=s)
