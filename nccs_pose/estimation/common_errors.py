@@ -95,4 +95,5 @@ def root_mean_square(values: Array) -> float:
 
 def _square(values: Array) -> float:
     """Sum of the squares of values of any shape."""
-    return float(np.vdot(values, values))
+    flat = values.ravel()
+    return float(flat.dot(flat))
