@@ -101,6 +101,15 @@ def test_tapes_of_nearly_the_floors_colour_are_found_where_there_is_light(
     assert sum(_found(localiser, scene, k) for k in range(20)) >= 18
 
 
+def test_a_coarse_image_is_not_taken_for_one_from_where_the_map_looks_nearly_the_same() -> None:
+    # The arena looks much the same half a turn on, and these tapes are hardly brighter than noise.
+    scene = _scene(('blue',) * 4, 'blue', 'neutral', width=320)
+    localiser = Localiser(scene.rig, scene.line_map)
+    for k in (24, 85, 116):
+        _found(localiser, scene, k)
+    assert sum(_found(localiser, scene, k) for k in range(10)) >= 1
+
+
 def test_tapes_of_nearly_the_floors_colour_are_found_in_dim_light() -> None:
     found = []
     for colour in ('green', 'blue'):

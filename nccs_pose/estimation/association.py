@@ -89,7 +89,7 @@ class Associator:
     def __init__(self, line_map: LineMap, table: FloorTable) -> None:
         lines = FloorLines(line_map)
         self._place = Place(lines, NearestLines(lines), FloorScale(table))
-        self._alike = _likenesses(line_map, self._place)
+        self._likenesses = _likenesses(line_map, self._place)
         self._last: StripScorer | None = None
 
     def candidates(
@@ -115,26 +115,24 @@ class Associator:
             poses, guessed, others = _promising(scorer, poses, told)
             poses, claimed, misfit = scorer.refined(poses, 1)
         else:
-            poses, claimed, misfit = self._with_likenesses(scorer, poses)
-        score = _harmonic(claimed, scorer.explained(poses))
-        found = distinct(poses, score)
-        refined = [FittedCandidate(*of) for of in zip(
-            poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
+            poses, claimed, misfit = scorer.refined(poses, 2)
+        refined = _fitted(scorer, poses, claimed, misfit)
         return Candidates(tuple(sorted((*refined, *guessed), key=lambda c: -c.score)), others)
 
-    def _with_likenesses(
-        self, scorer: StripScorer, poses: Poses,
-    ) -> tuple[Poses, Array, Array]:
-        """Poses laid on the strips, and those that they may be taken for, if these lie as well.
+    def taken_for(
+        self, pose: Pose2, segments: tuple[FloorSegment, ...],
+    ) -> list[FittedCandidate]:
+        """What a pose may be taken for in a coarse image.
 
-        :returns: as of :meth:`.StripScorer.refined`.
+        From there the map looks nearly the same, if there are such places: as the map has them,
+        and as the strips then lie, since of a coarse image neither is near enough for certain.
         """
-        count = len(poses.place)
-        poses, claimed, misfit = scorer.refined(poses.and_moved_by(self._alike), 2)
-        own = np.resize(misfit[:count], len(misfit))
-        well = (misfit <= own) & (claimed > 0.0)
-        well[:count] = True
-        return poses[well], claimed[well], misfit[well]
+        if not (self._likenesses and segments):
+            return []
+        scorer = self._scorer(segments)
+        places = Poses.of([likeness @ pose for likeness in self._likenesses])
+        return [*_fitted(scorer, places, scorer.claimed(places), np.zeros(len(places.place))),
+                *_fitted(scorer, *scorer.refined(places, 2))]
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
         """The score that a pose would have among the candidates, and the strips' part in it.
@@ -157,11 +155,11 @@ class Associator:
         return self._last
 
 
-def _likenesses(line_map: LineMap, place: Place) -> Poses:
+def _likenesses(line_map: LineMap, place: Place) -> tuple[Pose2, ...]:
     """Motions of a map that lay its lines near to its lines, but for its symmetries.
 
-    A coarse image may be taken for one from there. Where they are many no pair of strips tells one
-    from another, and all are among the poses anyway.
+    None where there are many: no pair of strips tells one from another then, and all are among
+    the candidates anyway.
     """
     tapes = tuple(FloorSegment(
         np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
@@ -169,10 +167,10 @@ def _likenesses(line_map: LineMap, place: Place) -> Poses:
     scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), place)
     poses = Poses(*poses_of_pairs(scorer.strips, place.lines, _PAIRS))
     if not 0 < len(poses.place) <= _CLOSE:
-        return _NONE
+        return ()
     poses, claimed, _ = scorer.refined(poses, 4)
     poses = poses[[k for k in distinct(poses, claimed) if claimed[k] > _MUCH]]
-    return poses[unlike(poses, Poses.of(map_symmetries(line_map)))]
+    return tuple(poses[unlike(poses, Poses.of(map_symmetries(line_map)))].listed())
 
 
 def _promising(
@@ -200,6 +198,16 @@ def _promising(
     return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
         poses[guessed].listed(),
         *(part[guessed].tolist() for part in (score, claimed, misfit)))], others
+
+
+def _fitted(
+    scorer: StripScorer, poses: Poses, claimed: Array, misfit: Array,
+) -> list[FittedCandidate]:
+    """Poses and what is known of them, as of :meth:`.StripScorer.refined`; one of each."""
+    score = _harmonic(claimed, scorer.explained(poses))
+    found = distinct(poses, score)
+    return [FittedCandidate(*of) for of in zip(
+        poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
 
 
 def _harmonic(a: Array, b: Array) -> Array:

@@ -32,6 +32,9 @@ from nccs_pose.geometry.pose import Pose2
 # A pose that leaves more of the strips unexplained than another by this much is no rival of it:
 # where a coarse image seemed to show a wrong pose, the right one explained as much or more.
 AS_MUCH = 0.05
+# Nor is one that shows less than this part of it, on the image and by strips: of wrong poses that
+# seemed right on a coarse image nearly all showed less than this and the right one more.
+ABOUT_AS_MUCH = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +119,11 @@ class Ledger:
     def was_laid(self, pose: Pose2) -> bool:
         """Whether a pose is one that lies on the image."""
         return any(same_pose(pose, other) for other in self._laid)
+
+    @property
+    def has_refused(self) -> bool:
+        """Whether a pose that lies on the image was refused."""
+        return len(self._laid) > len(self._held)
 
     def is_tied(self) -> bool:
         """Whether several poses explain the image about as well as the best of them."""
@@ -235,7 +243,7 @@ class Ledger:
             pose = doubtful.alignment.pose
             # How well its lines lie says little on an image that leaves such doubts.
             if doubtful.shown >= self._ratio * best.shown:
-                found.append(Candidate(pose, min(doubtful.score, best.score)))
+                found.append(Candidate(pose, min(doubtful.shown / best.shown, 1.0) * best.score))
             else:
                 self._hidden.append(Candidate(pose, doubtful.by_strips))
         # A twin shows what the pose that holds does, even if it was laid on the image and refused.
@@ -263,9 +271,14 @@ class Ledger:
 def _ranked(held: list[Found]) -> list[Found]:
     """Poses that hold, best first.
 
-    One that misses lines is worth no more than one that misses none, as well as the others lie:
-    those that lie badly may be among what it does without.
+    One that shows less than another, or misses lines where that misses none, is worth no more, as
+    well as its lines lie: those that lie badly may be among what it does without.
     """
-    most = max((f.score for f in held if not f.alignment.missing), default=1.0)
-    capped = [replace(f, score=min(f.score, most)) if f.alignment.missing else f for f in held]
-    return sorted(capped, key=lambda f: (-f.score, len(f.alignment.missing)))
+    worth = [
+        min(f.score, max((
+            g.score for g in held
+            if g.shown > f.shown or (f.alignment.missing and not g.alignment.missing)),
+            default=1.0))
+        for f in held]
+    capped = [replace(f, score=score) for f, score in zip(held, worth)]
+    return sorted(capped, key=lambda f: (-f.score, len(f.alignment.missing), -f.shown))

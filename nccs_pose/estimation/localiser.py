@@ -105,7 +105,8 @@ class Localiser:
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
         self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
-        self._sifter = Sifter(aligner, self._judge, self._symmetries, options)
+        self._sifter = Sifter(
+            aligner, self._searcher, self._judge, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""

@@ -46,13 +46,6 @@ class Poses:
     def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int]) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
-    def and_moved_by(self, motions: Poses) -> Poses:
-        """These poses, and each moved by each of some motions of the map."""
-        turned = motions.rotation[:, None]
-        moved = motions.place[:, None] + turned * self.place
-        return Poses(np.append(self.rotation, turned * self.rotation),
-                     np.append(self.place, moved))
-
     def listed(self) -> list[Pose2]:
         """Each of them."""
         place, yaw = self.place, np.angle(self.rotation)

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from itertools import permutations
 import math
 
-from nccs_pose.estimation.association import Associator, Candidates
+from nccs_pose.estimation.association import Associator, Candidates, FittedCandidate
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
@@ -169,6 +169,10 @@ class Searcher:
     def candidates(self, segments: Strips, told: Told | None = None) -> Candidates:
         """Poses that explain the strips; of too many those where it is told."""
         return self._associator.candidates(segments, told)
+
+    def taken_for(self, pose: Pose2, segments: Strips) -> list[FittedCandidate]:
+        """What a pose may be taken for in a coarse image."""
+        return self._associator.taken_for(pose, segments)
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

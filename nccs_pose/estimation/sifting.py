@@ -17,19 +17,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 
 from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, shown, UNFIXED
-from nccs_pose.estimation.ledger import AS_MUCH, Ledger, Refused, Sifted
+from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, UNFIXED
+from nccs_pose.estimation.ledger import ABOUT_AS_MUCH, AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import misses_lines, Objection
@@ -47,7 +48,8 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.75
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
-# So does a pose that explains more than this of what should be seen and of what is.
+# So does a pose that explains more than this of what should be seen and of what is, unless another
+# that lies on it was refused.
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
@@ -80,6 +82,11 @@ class _Start:
         """How far the strips lie off its lines, px."""
         return 0.0 if self.strips is None else self.strips.misfit
 
+    @property
+    def reaches(self) -> tuple[float, ...]:
+        """How far around it to look, px: at its place first, if its strips lie there."""
+        return (LINEAR_PX, self.reach) if self.misfit < LINEAR_PX else (self.reach,)
+
     def kept(self, pose: Pose2) -> FittedCandidate | None:
         """What the strips say of the pose that it became on the image; None where that is new."""
         moved = np.abs(pose.minus(self.pose))
@@ -111,7 +118,7 @@ class Sifter:
     """Lays poses on images of one rig and map."""
 
     def __init__(
-        self, aligner: Aligner, judge: Judge, symmetries: tuple[Pose2, ...],
+        self, aligner: Aligner, searcher: Searcher, judge: Judge, symmetries: tuple[Pose2, ...],
         options: LocaliserOptions,
     ) -> None:
         """Prepare.
@@ -119,6 +126,7 @@ class Sifter:
         :param symmetries: motions of the map that change nothing, without the identity.
         """
         self._aligner = aligner
+        self._searcher = searcher
         self._judge = judge
         self._symmetries = symmetries
         self._options = options
@@ -151,23 +159,33 @@ class Sifter:
                 if start.strips is not None:
                     ledger.leave(start.strips)
                 continue
-            found = self._tried(case, start, ledger)
-            if found is not None:
+            tried = self._tried(case, start, ledger)
+            if isinstance(tried, Found):
                 starts += (_Start(twin, _SEARCH_BAND)
-                           for twin in ledger.hold(found, start.strips))
+                           for twin in ledger.hold(tried, start.strips))
                 undecided = self._is_undecided(case, ledger)
-            elif start.strips is not None and ledger.best is None:
+                continue
+            if tried is not None and not _is_sharp(tried):
+                starts.extendleft(self._taken_for(case, tried))
+            if start.strips is not None and ledger.best is None:
                 in_vain += 1
         return ledger.closed()
 
-    def _tried(self, case: Case, start: _Start, ledger: Ledger) -> Found | None:
-        """A pose laid on the image, if it holds; else what came of it is in the ledger."""
+    def _taken_for(self, case: Case, alignment: Alignment) -> Iterator[_Start]:
+        """From where the map looks nearly the same as from a pose that was laid on the image."""
+        return map(_Start.of, self._searcher.taken_for(alignment.pose, case.sight.segments))
+
+    def _tried(self, case: Case, start: _Start, ledger: Ledger) -> Found | Alignment | None:
+        """A pose laid on the image, with what it explains if it holds; None where it does not lie.
+
+        What came of one that does not hold is in the ledger.
+        """
         if case.prediction is None and start.strips is not None:
             against = self._judge.beforehand(start.strips)
             if against is not None:
                 ledger.rule_out(start.strips, against)
                 return None
-        verdict = self._again(case, start) or self._verdict(case, start, ledger)
+        verdict = self._again(case, start, ledger) or self._verdict(case, start, ledger)
         if verdict is None:
             ledger.miss(start.pose)
             return None
@@ -180,7 +198,7 @@ class Sifter:
             ledger.hide(found, self._measured(case.sight, start, alignment))
         else:
             ledger.refuse(found, alignment)
-        return None
+        return alignment
 
     def _is_undecided(self, case: Case, ledger: Ledger) -> bool:
         """Whether an image decides nothing between poses that hold, nor does anything else."""
@@ -207,9 +225,7 @@ class Sifter:
         may be there.
         """
         sight, verdict = case.sight, None
-        for reach in (LINEAR_PX, start.reach):
-            if reach == LINEAR_PX and start.misfit >= LINEAR_PX:
-                continue
+        for reach in start.reaches:
             alignment = self._aligner.align(
                 sight.image, start.pose, sight.colours, reach=reach,
                 hopeless=misses_lines if case.prediction is None else None)
@@ -221,13 +237,15 @@ class Sifter:
             found = self._judge.found(
                 sight.image, alignment, sight.segments, case.doubts, expected=expected,
                 strips=start.kept(alignment.pose))
-            verdict = alignment, self._unless_doubtful(case, found, expected)
+            verdict = alignment, self._unless_doubtful(case, ledger, found, expected)
             if isinstance(verdict[1], Found) or not (
                     alignment.missing or verdict[1] is UNFIXED):
                 break
         return verdict
 
-    def _again(self, case: Case, start: _Start) -> tuple[Alignment, Found | Objection] | None:
+    def _again(
+        self, case: Case, start: _Start, ledger: Ledger,
+    ) -> tuple[Alignment, Found | Objection] | None:
         """Judge a pose that was laid on the image at another look by what is new at this one.
 
         None where it was not, or where other colours may show lines that it missed.
@@ -243,7 +261,7 @@ class Sifter:
             found = self._judge.by_strips(
                 alignment, case.sight.segments, expected=expected,
                 strips=start.kept(alignment.pose))
-            return alignment, self._unless_doubtful(case, found, expected)
+            return alignment, self._unless_doubtful(case, ledger, found, expected)
         return None
 
     def _expected(self, case: Case, alignment: Alignment) -> bool:
@@ -254,20 +272,21 @@ class Sifter:
         return self._judge.measured(alignment, sight.segments, start.kept(alignment.pose))
 
     def _unless_doubtful(
-        self, case: Case, found: Found | Objection, expected: bool,
+        self, case: Case, ledger: Ledger, found: Found | Objection, expected: bool,
     ) -> Found | Objection:
         """A verdict, unless the strips speak as much for another pose, and the image for neither.
 
         On an image so coarse that lines lie badly on it how well they lie says little, and what a
-        pose shows of strips and lines has to stand out among those that lie on it. Nor need the
-        right one be among the candidates, since strips lie askew: a pose has to show all the lines
-        that should be in view. Where the image decides nothing there is no doubt.
+        pose shows of strips and lines has to stand out among those that lie on it, and where the
+        map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
+        pose has to show all the lines that should be in view. Where the image decides nothing
+        there is no doubt.
         """
         if isinstance(found, Objection) or expected:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
-        sharp = fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
-        if sharp or min(found.claimed, alignment.explained) > _PLAINLY_ALL:
+        plain = min(found.claimed, alignment.explained) > _PLAINLY_ALL and not ledger.has_refused
+        if plain or _is_sharp(alignment):
             return found
         if alignment.missing:
             return _INCOMPLETE
@@ -275,15 +294,27 @@ class Sifter:
             return found
         least = self._options.ambiguity_ratio * found.by_strips
         rivals = (
-            c for c in candidates
+            _Start.of(c) for c in candidates
             if c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
                 c.pose, alignment.pose))
-        doubted = any(self._shows_as_much(case, rival, found) for rival in rivals)
+        doubted = any(
+            self._shows_as_much(case, rival, found)
+            for rival in chain(rivals, self._taken_for(case, alignment)))
         return _DOUBTFUL if doubted else found
 
-    def _shows_as_much(self, case: Case, rival: FittedCandidate, found: Found) -> bool:
-        """Whether a candidate shows about as much, laid on the image, as a pose that holds."""
-        alignment = self._aligner.align(
-            case.sight.image, rival.pose, case.sight.colours, reach=_SEARCH_BAND)
-        return alignment is not None and shown(
-            rival.score, alignment) >= self._options.ambiguity_ratio * found.shown
+    def _shows_as_much(self, case: Case, rival: _Start, found: Found) -> bool:
+        """Whether a rival shows about as much, laid on the image, as a pose that holds."""
+        least = ABOUT_AS_MUCH * found.shown
+        for reach in rival.reaches:
+            # What tapes look like is known by now.
+            alignment = self._aligner.align(
+                case.sight.image, rival.pose, found.alignment.colours, reach=reach)
+            if alignment is not None and self._measured(
+                    case.sight, rival, alignment).shown >= least:
+                return True
+        return False
+
+
+def _is_sharp(alignment: Alignment) -> bool:
+    """Whether lines lie so well on the image that it shows by itself where they are."""
+    return fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
