@@ -37,9 +37,11 @@ from numpy.typing import NDArray
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 SPACING = 2.0
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
-# first, rough pass takes one station of so many; a search takes so many of each line, this far
-# apart (px) or more.
-_ROUGH = 4
+# first, rough pass takes one station of so many. On more curve than this, px, these few show what
+# tapes look like as well, and a second pass takes some too. A search takes so many of each line,
+# this far apart (px) or more.
+_SOME = (4, 2)
+_LONG = 2000.0
 _SEARCHED = 25
 _SEARCHED_SPACING = 8.0
 # A profile is linear in its shift for about so many pixels.
@@ -111,20 +113,19 @@ class Aligner:
         begun = self._begun(image, places, pose, prior, colours, reach)
         if begun is None:
             return None
-        pose, attitude = begun
+        pose, attitude, colours = begun
         result: Alignment | None = None
         for k in range(_ITERATIONS):
             measured = self._measure(
                 image, places, pose, prior, colours, attitude, rough=False)
-            if measured is None:
+            if measured is None or measured.length < _LEAST_LENGTH:
                 return None
             known, colours = colours, measured.colours
             result = alignment_of(measured, self._lines)
             if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
                 return None
             step = result.pose.minus(pose)
-            sharpest = min(colour.blur for colour in colours)
-            steady = max(abs(a.blur - b.blur) for a, b in zip(known, colours)) < _LEARNED_BLUR
+            sharpest, steady = _sharpest(colours), _is_steady(known, colours)
             settled = steady and (
                 measured.moved < _SETTLED_BLURS * sharpest or close(
                     result.pose, pose, result.covariance, _SETTLED))
@@ -144,22 +145,34 @@ class Aligner:
     def _begun(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
         prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], reach: float,
-    ) -> tuple[Pose2, Array] | None:
-        """The pose and the base's attitude to go on from: after a rough pass, if one is needed.
+    ) -> tuple[Pose2, Array, tuple[LineColour, ...]] | None:
+        """The pose, the base's attitude and the colours to go on from.
 
-        None where the start may be off, and too little is found.
+        Where the start may be off they are of passes over some of the stations, until all will
+        hardly say anything else. None where it may be, and too little is found.
         """
-        level, sharpest = np.zeros(3), min(colour.blur for colour in colours)
-        inexact = sharpest < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
-        if not inexact or len(places) < _ROUGH * _LEAST_STATIONS:
-            return start, level
-        rough = self._measure(
-            image, places.every(_ROUGH), start, prior, colours, level, rough=True)
-        if rough is None:
-            return None if reach > 0.0 else (start, level)
-        # What profiles bear needs no bands of its own.
-        leans = np.abs(rough.leant).max() > _SETTLED_BLURS * sharpest
-        return rough.refinement.pose, rough.refinement.attitude if leans else level
+        pose, attitude = start, np.zeros(3)
+        inexact = _sharpest(colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
+        long = reach > 0.0 and float(places.spacing.sum()) > _LONG
+        if not (inexact or long) or len(places) < _SOME[0] * _LEAST_STATIONS:
+            return pose, attitude, colours
+        for k, step in enumerate(_SOME[:1 + long]):
+            sharpest = _sharpest(colours)
+            measured = self._measure(
+                image, places.every(step), pose, prior, colours, attitude,
+                rough=not long or (k == 0 and sharpest < ROUGH_BLUR))
+            if measured is None:
+                if inexact and reach > 0.0:
+                    return None
+                break
+            # What profiles bear needs no bands of its own.
+            leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest
+            pose, attitude = measured.refinement.pose, (
+                measured.refinement.attitude if leans else attitude)
+            known, colours = colours, measured.colours
+            if measured.moved < LINEAR_PX and _is_steady(known, colours):
+                break
+        return pose, attitude, colours
 
     def _fit(
         self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...], rough: bool,
@@ -227,8 +240,6 @@ class Aligner:
         used, = felt.nonzero()
         if len(used) < _LEAST_STATIONS:
             return None
-        if not rough and bands.spacing.dot(felt) < _LEAST_LENGTH:
-            return None
         by_pose, by_attitude = slide.T[:3], slide.T[3:]
         refinement = self._solved(
             (fit.shift + attitude.dot(by_attitude)).take(used), fit.sigma.take(used),
@@ -239,3 +250,13 @@ class Aligner:
         moved = refinement.pose.minus(start).dot(by_pose) + leant
         return Pass(
             refinement, bands, fit, used, float(np.abs(moved).max()), leant, colours)
+
+
+def _sharpest(colours: tuple[LineColour, ...]) -> float:
+    """The least blur of colours, px."""
+    return min(colour.blur for colour in colours)
+
+
+def _is_steady(known: tuple[LineColour, ...], learned: tuple[LineColour, ...]) -> bool:
+    """Whether a pass learned hardly another blur than was known."""
+    return max(abs(a.blur - b.blur) for a, b in zip(known, learned)) < _LEARNED_BLUR

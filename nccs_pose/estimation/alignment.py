@@ -115,6 +115,11 @@ class Pass:
     leant: Array
     colours: tuple[LineColour, ...]
 
+    @property
+    def length(self) -> float:
+        """Of curve that the stations stand for where the tape was felt, px."""
+        return float(self.bands.spacing.take(self.used).sum())
+
 
 def alignment_of(measured: Pass, lines: int) -> Alignment:
     """What a last pass over a map of so many lines comes to."""
