@@ -28,6 +28,7 @@ from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
+import numpy as np
 
 # A pose that leaves more of the strips unexplained than another by this much is no rival of it:
 # where a coarse image seemed to show a wrong pose, the right one explained as much or more.
@@ -259,13 +260,14 @@ class Ledger:
         """Candidates that were not laid on the image, nor their likes."""
         if not left:
             return []
+        poses = Poses.of([strips.pose for strips in left])
         # They differ among themselves.
-        new = unlike(Poses.of([strips.pose for strips in left]), Poses.of(known))
+        new = unlike(poses, Poses.of(known))
+        score = np.minimum(
+            np.array([strips.score for strips in left]) / best.by_strips, 1.0) * best.score
         # Strips that lie askew do so at all places where they look the same.
-        return [
-            Candidate(
-                strips.pose @ self._moved, min(strips.score / best.by_strips, 1.0) * best.score)
-            for strips, differs in zip(left, new.tolist()) if differs]
+        moved = poses[new].and_on_by(self._moved)
+        return [Candidate(*of) for of in zip(moved.listed(), score[new].tolist())]
 
 
 def _ranked(held: list[Found]) -> list[Found]:

@@ -46,6 +46,12 @@ class Poses:
     def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int]) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
+    def and_on_by(self, step: Pose2) -> Poses:
+        """Where a robot is that goes on from each by the same step, of base_link."""
+        return Poses(
+            self.rotation * complex(math.cos(step.yaw), math.sin(step.yaw)),
+            self.place + self.rotation * complex(step.x, step.y))
+
     def listed(self) -> list[Pose2]:
         """Each of them."""
         place, yaw = self.place, np.angle(self.rotation)

@@ -24,6 +24,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
+from numpy.typing import NDArray
 
 # A pose rests on a line when it does on this part of the line's stations.
 _RESTS = 0.25
@@ -159,10 +160,12 @@ def contradiction(
     An occluded line is nowhere. A line beside its place says that the map, the rig or the pose
     is wrong, and the pixels cannot tell which.
     """
+    if not alignment.missing or not segments:
+        return None
+    known = _lie_on_map(segments, alignment.pose, line_map).tolist()
+    foreign = [strip for strip, lies in zip(segments, known) if not lies]
     for k in alignment.missing:
-        for strip in segments:
-            if _lies_on_map(strip, alignment.pose, line_map):
-                continue
+        for strip in foreign:
             offset = _beside(strip, alignment.pose, line_map[k])
             if offset is not None:
                 return Objection(
@@ -185,18 +188,19 @@ def _beside(strip: FloorSegment, pose: Pose2, line: Line) -> float | None:
     return abs(across) if inside and abs(across) < _NEAR else None
 
 
-def _lies_on_map(strip: FloorSegment, pose: Pose2, line_map: LineMap) -> bool:
-    """Whether a strip is explained by some line of the map."""
-    ends = pose.apply(np.array([strip.start, strip.end]))
-    for line in line_map:
-        direction = line.direction[:2]
-        offset = ends - line.start[:2]
-        across = np.abs(offset @ np.array([-direction[1], direction[0]]))
-        along = offset @ direction
-        if (across.max() < _ON + 1.5 * strip.footprint and along.max() > 0.0
-                and along.min() < line.length):
-            return True
-    return False
+def _lie_on_map(
+    segments: tuple[FloorSegment, ...], pose: Pose2, line_map: LineMap,
+) -> NDArray[np.bool_]:
+    """Whether each strip is explained by some line of the map (S,)."""
+    ends = pose.apply(np.array([(strip.start, strip.end) for strip in segments]))
+    offset = ends[:, :, None] - line_map.starts[:, :2]
+    x, y = line_map.directions[:, :2].T
+    along = offset[..., 0] * x + offset[..., 1] * y
+    across = np.abs(offset[..., 1] * x - offset[..., 0] * y).max(axis=1)
+    near = _ON + 1.5 * np.array([strip.footprint for strip in segments])
+    on = (across < near[:, None]) & (along.max(axis=1) > 0.0) & (
+        along.min(axis=1) < line_map.lengths)
+    return np.asarray(on.any(axis=1))
 
 
 def what_is_missing(segments: tuple[FloorSegment, ...]) -> str:

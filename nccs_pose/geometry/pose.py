@@ -53,7 +53,12 @@ class Pose2:
     yaw: float = 0.0
 
     def __post_init__(self) -> None:
-        x, y, yaw = float(self.x), float(self.y), float(self.yaw)
+        x, y, yaw = self.x, self.y, self.yaw
+        # Of hundreds of poses all are as they should be, most often.
+        if type(x) is type(y) is type(yaw) is float and (
+                -math.pi < yaw <= math.pi and math.isfinite(x) and math.isfinite(y)):
+            return
+        x, y, yaw = float(x), float(y), float(yaw)
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(yaw)):
             raise GeometryError(f'pose ({x}, {y}, {yaw}) is not finite')
         object.__setattr__(self, 'x', x)
