@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.ledger import AS_MUCH
 from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.told import Told
@@ -62,10 +63,16 @@ class Sight:
 
     @property
     def is_promising(self) -> bool:
-        """Whether the best pose leaves little to look for, or is far better than all others."""
-        second = self.candidates[1].score if len(self.candidates) > 1 else 0.0
-        return self.promise > _PLAIN or (
-            self.promise > 0.5 * _PLAIN and second < _RIVAL * self.promise)
+        """Whether the best pose leaves little to look for, or is far better than all others.
+
+        No rival of one that leaves no strip unexplained is what leaves some.
+        """
+        if self.promise > _PLAIN or self.promise <= 0.5 * _PLAIN:
+            return self.promise > _PLAIN
+        best, *others = self.candidates
+        least = best.claimed - AS_MUCH if best.claimed > ALL_STRIPS else 0.0
+        return not any(
+            c.score >= _RIVAL * best.score and c.claimed >= least for c in others)
 
     @property
     def is_of_many_places(self) -> bool:
