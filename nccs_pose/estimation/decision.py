@@ -69,16 +69,17 @@ def left_open(
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
     # What is left open shows so much of what the best does, in the images before as well.
     before = best.mean / held[0].score
+    most = _CARRIED - 1
     others = sorted(
-        (*others, *(Hypothesis(c.pose, (before * c.score,)) for c in sifted.open)),
+        (*others, *(Hypothesis(c.pose, (before * c.score,)) for c in sifted.open[:most])),
         key=lambda h: -h.mean)
-    carried_on = (best, *others[:_CARRIED - 1])
+    carried_on = (best, *others[:most])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-    more = [Candidate(h.pose, h.mean) for h in others[_CARRIED - 1:]]
-    more += (Candidate(c.pose, before * c.score) for c in sifted.rest)
+    more = [Candidate(h.pose, h.mean) for h in others[most:]]
+    more += [Candidate(c.pose, before * c.score) for c in (*sifted.open[most:], *sifted.rest)]
     if len(sifted.others.place) > 0:
         # They show no more than the least of what was looked at closely, for all that is known.
-        least = min(best.mean, *(h.mean for h in others), *(c.score for c in more))
-        more += (Candidate(pose, least) for pose in sifted.others.listed())
+        least = min([*(h.mean for h in (best, *others)), *(c.score for c in more)])
+        more += [Candidate(pose, least) for pose in sifted.others.listed()]
     return carried_on, more

@@ -54,7 +54,8 @@ class Sifted:
     :ivar hidden: poses that would, if something hid the lines that they miss.
     :ivar refused: the others, the best first.
     :ivar open: poses that may explain it as well as the best of those that hold, but were not
-        laid on it, or that it cannot tell from another; their scores are no higher than its.
+        laid on it, or that it cannot tell from another, best first; their scores are no higher
+        than its.
     :ivar rest: poses that explain the strips as well, but of which these show fewer lines; they
         were not laid on it either.
     :ivar others: more poses that leave no strip unexplained, which were not looked at closely.
@@ -210,16 +211,15 @@ class Ledger:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
         best, poses = held[0], [f.alignment.pose for f in held]
         left_open = self._open(poses, best)
-        known, least = [*poses, *self._laid], self._ratio * best.by_strips
+        known, least = Poses.of([*poses, *self._laid]), self._ratio * best.by_strips
         left_open += self._unlaid([c for c in self._left if c.score >= least], known, best)
         # More of the lines of what explains the same strips may be there than they show.
+        less = (*(c for c in self._left if c.score < least), *self._passed_over)
         rest = self._unlaid(
-            [c for c in (*self._left, *self._passed_over)
-             if c.claimed > best.claimed - AS_MUCH],
-            [*known, *(c.pose for c in left_open)], best)
+            [c for c in less if c.claimed > best.claimed - AS_MUCH], known, best)
         others = self._others
         if len(others.place) > 0:
-            others = others[unlike(others, Poses.of(known))]
+            others = others[unlike(others, known)]
         return Sifted(
             held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest,
             others)
@@ -255,14 +255,14 @@ class Ledger:
         return found
 
     def _unlaid(
-        self, left: list[FittedCandidate], known: list[Pose2], best: Found,
+        self, left: list[FittedCandidate], known: Poses, best: Found,
     ) -> list[Candidate]:
         """Candidates that were not laid on the image, nor their likes."""
         if not left:
             return []
         poses = Poses.of([strips.pose for strips in left])
         # They differ among themselves.
-        new = unlike(poses, Poses.of(known))
+        new = unlike(poses, known)
         score = np.minimum(
             np.array([strips.score for strips in left]) / best.by_strips, 1.0) * best.score
         # Strips that lie askew do so at all places where they look the same.

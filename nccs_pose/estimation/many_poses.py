@@ -55,7 +55,7 @@ class Poses:
     def listed(self) -> list[Pose2]:
         """Each of them."""
         place, yaw = self.place, np.angle(self.rotation)
-        return [Pose2(*at) for at in zip(place.real.tolist(), place.imag.tolist(), yaw.tolist())]
+        return list(map(Pose2, place.real.tolist(), place.imag.tolist(), yaw.tolist()))
 
 
 def same_pose(a: Pose2, b: Pose2) -> bool:
