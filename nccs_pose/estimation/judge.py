@@ -150,6 +150,9 @@ class Judge:
 
         :param strips: what these say of it, if that is known.
         """
+        # What no lines hold in its place tells nothing of where other lines are.
+        if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
+            return UNFIXED
         return self.objection(image, alignment, doubts, expected=expected) or self.by_strips(
             alignment, segments, expected=expected, strips=strips)
 
@@ -162,8 +165,6 @@ class Judge:
         if against is not None:
             return against
         found = self.measured(alignment, segments, strips)
-        if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
-            return UNFIXED
         used = lines_used(alignment)
         weaker, stronger = sorted((found.claimed, alignment.explained))
         if alignment.missing and len(segments) < _LEAST_STRIPS:
