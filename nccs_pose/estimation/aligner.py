@@ -46,6 +46,9 @@ _SEARCHED = 25
 _SEARCHED_SPACING = 8.0
 # A profile is linear in its shift for about so many pixels.
 LINEAR_PX = 2.0
+# What a first pass moves a start by more than this, px, that should be off by less than that, is
+# nowhere near.
+_ASTRAY_PX = 5.0
 _ITERATIONS = 8
 # The poses have settled when the last step moved no station by more than this share of the blur
 # (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
@@ -165,6 +168,8 @@ class Aligner:
                 if inexact and reach > 0.0:
                     return None
                 break
+            if 0.0 < reach <= LINEAR_PX and measured.moved > _ASTRAY_PX:
+                return None
             # What profiles bear needs no bands of its own.
             leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest
             pose, attitude = measured.refinement.pose, (
