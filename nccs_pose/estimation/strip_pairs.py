@@ -22,6 +22,7 @@ import math
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.geometry.floor_table import as_complex, Complex
 from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,6 +67,29 @@ class FloorLines:
         turn = self.direction * self.direction.conj()[:, None]
         first, second = np.nonzero(np.abs(turn.imag) > math.sin(_CROSSING - _ANGLE_GATE))
         return first, second, turn[first, second]
+
+    @cached_property
+    def gaps(self) -> tuple[Array, Array]:
+        """How near and how far apart points of the lines that cross may be (X,), metres.
+
+        Of lines as long as strips may seem to be.
+        """
+        first, second, _ = self.crossings
+        beyond = np.array([-BEYOND, BEYOND])
+        ends = self.start[:, None] + self.direction[:, None] * (
+            beyond + np.stack([np.zeros_like(self.length), self.length], axis=1))
+        apart = np.abs(ends[first, :, None] - ends[second, None])
+        # Where each one's ends are as seen along the other; those of lines that meet are on both
+        # sides of each other.
+        near, meet = apart.min(axis=(1, 2)), np.ones(len(first), dtype=bool)
+        for one, other in ((first, second), (second, first)):
+            seen = (ends[one] - ends[other, :1]) * self.direction[other, None].conj()
+            off = np.hypot(
+                seen.real - np.clip(seen.real, 0.0, self.length[other, None] + 2.0 * BEYOND),
+                seen.imag)
+            near = np.minimum(near, off.min(axis=1))
+            meet &= seen.imag[:, 0] * seen.imag[:, 1] < 0.0
+        return np.where(meet, 0.0, near), apart.max(axis=(1, 2))
 
 
 class StripLines:
@@ -116,6 +140,9 @@ def poses_of_pairs(
     match = np.abs((turn * between.conj()[:, None]).imag) < np.sin(gate)[:, None]
     fits = strips.fits(lines)
     match &= fits[first][:, a] & fits[second][:, b]
+    apart = np.abs(strips.middle[second] - strips.middle[first])[:, None]
+    near, far = lines.gaps
+    match &= (apart > near) & (apart < far)
     pair, crossing = np.nonzero(match)
     if len(pair) == 0:
         return np.zeros(0, complex), np.zeros(0, complex)
