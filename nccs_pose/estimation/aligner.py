@@ -49,6 +49,8 @@ LINEAR_PX = 2.0
 # What a first pass moves a start by more than this, px, that should be off by less than that, is
 # nowhere near.
 _ASTRAY_PX = 5.0
+# A search that ends this near a pose, m and rad, is refined to it.
+_SAME = (0.01, 0.005)
 _ITERATIONS = 8
 # The poses have settled when the last step moved no station by more than this share of the blur
 # (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
@@ -91,6 +93,7 @@ class Aligner:
         reach: float = 0.0,
         prior: tuple[Pose2, Array] | None = None,
         hopeless: Callable[[Alignment], bool] | None = None,
+        laid: Pose2 | None = None,
     ) -> Alignment | None:
         """Lay a pose on the image from a start near it.
 
@@ -101,13 +104,14 @@ class Aligner:
             view do not fix.
         :param hopeless: whether a pose that will not move any further is refused in any case: one
             that is comes back as it is, before it has settled.
-        :returns: None where too little of what the start predicts is found, or where the poses do
-            not settle.
+        :param laid: a pose that lies on the image already.
+        :returns: None where too little of what the start predicts is found, where a search leads
+            to what is laid, or where the poses do not settle.
         """
         pose = start
         if reach > LINEAR_PX:
             searched = self._search(image, start, colours, reach, prior)
-            if searched is None:
+            if searched is None or (laid is not None and _near(searched, laid)):
                 return None
             pose = searched
         places = self._predictor.places(pose, SPACING, self._options.stations)
@@ -255,6 +259,12 @@ class Aligner:
         moved = refinement.pose.minus(start).dot(by_pose) + leant
         return Pass(
             refinement, bands, fit, used, float(np.abs(moved).max()), leant, colours)
+
+
+def _near(a: Pose2, b: Pose2) -> bool:
+    """Whether two poses are so near that passes lead from either to the same."""
+    x, y, yaw = np.abs(a.minus(b)).tolist()
+    return bool(max(x, y) < _SAME[0] and yaw < _SAME[1])
 
 
 def _sharpest(colours: tuple[LineColour, ...]) -> float:

@@ -228,7 +228,8 @@ class Sifter:
         for reach in start.reaches:
             alignment = self._aligner.align(
                 sight.image, start.pose, sight.colours, reach=reach,
-                hopeless=misses_lines if case.prediction is None else None)
+                hopeless=misses_lines if case.prediction is None else None,
+                laid=None if verdict is None else verdict[0].pose)
             if alignment is None:
                 continue
             if ledger.was_laid(alignment.pose):
