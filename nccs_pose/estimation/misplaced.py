@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import Alignment
-from nccs_pose.estimation.verdict import line_offsets
+from nccs_pose.estimation.verdict import DISTURBED, line_offsets
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
@@ -54,10 +54,9 @@ _PLAIN_SHARE = 0.8
 # What is thinner than this, px, is outshone by what surrounds it.
 _LEAST_WIDTH = 0.31
 # Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
-# more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
+# more than what surrounds a tape shifts it.
 _BESIDE = 0.5
 _EVIDENT = 5.0
-_DISTURBED = 0.28
 # It is in its place when it is off by less than this for certain, px.
 _IN_PLACE = 0.5
 # What lies this near another line, metres beyond its footprint, is that line.
@@ -117,7 +116,7 @@ def placement(
     if float(np.mean(np.abs(shift))) <= _CAPTURED:
         if found < _LEAST_STATIONS:
             return Placement()
-        if off <= max(_BESIDE, _DISTURBED / width, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
+        if off <= max(_BESIDE, DISTURBED / width, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
             return Placement(confirmed=confirmed)
         shift = np.full(len(bands), mean)
     if width < _LEAST_WIDTH or _on_another(line, bands, shift + moved, alignment, line_map, table):

@@ -34,9 +34,10 @@ _PARALLEL = 0.12
 _NEAR = 0.6
 # A strip closer than this to a map line lies on it, metres beyond its own footprint.
 _ON = 0.06
-# A whole line lies off its place when its mean is this many standard deviations from zero: what
-# surrounds a tape of a third of a pixel shifts it by more than its scatter tells.
+# A whole line lies off its place when its mean is this many standard deviations from zero; and by
+# more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
 _EVIDENT = 7.0
+DISTURBED = 0.28
 # Residuals so many times the noise of the image, and larger than this (px), say that two lines are
 # others, or not seen by this rig; that three are; and that more are, where none was expected.
 _UNLIKE_NOISE = ((5.0, 0.0), (3.0, 0.3), (3.0, 0.4))
@@ -122,7 +123,8 @@ def _line_off(alignment: Alignment, lines: int, most: float) -> tuple[int, float
     if size.max() <= most:
         return None
     _, deviation = line_offsets(alignment, lines)
-    size[size <= np.maximum(most, _EVIDENT * deviation)] = 0.0
+    least = np.maximum(most, _EVIDENT * deviation)
+    size[size <= np.fmax(least, DISTURBED / alignment.width)] = 0.0
     k = int(size.argmax())
     return (k, float(size[k])) if size[k] > 0.0 else None
 
