@@ -24,7 +24,7 @@ from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.nearest_lines import NearestLines
-from nccs_pose.estimation.strip_pairs import FloorLines
+from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_scale import FloorScale
@@ -600,3 +600,18 @@ def test_same_pose_is_close_in_place_and_heading() -> None:
     assert same_pose(a, Pose2(1.1, 2.1, -np.pi + 0.02))
     assert not same_pose(a, Pose2(1.0, 2.0, np.pi - 0.3))
     assert not same_pose(a, Pose2(1.3, 2.0, np.pi - 0.02))
+
+
+def test_points_of_two_lines_are_as_far_apart_as_is_told() -> None:
+    rng = np.random.default_rng(4)
+    ends = rng.uniform(-3.0, 3.0, (12, 2, 2))
+    lines = FloorLines(LineMap(tuple(_line(tuple(a), tuple(b)) for a, b in ends)))
+    first, second, _ = lines.crossings
+    near, far = lines.gaps
+    share = np.linspace(0.0, 1.0, 200)
+    at = lines.start[:, None] + lines.direction[:, None] * (
+        share * (lines.length[:, None] + 2.0 * BEYOND) - BEYOND)
+    apart = np.abs(at[first, :, None] - at[second, None])
+    np.testing.assert_allclose(apart.max(axis=(1, 2)), far)
+    nearest = apart.min(axis=(1, 2))
+    assert (nearest > near - 1e-9).all() and (nearest < near + 0.05).all()

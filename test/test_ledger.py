@@ -25,10 +25,12 @@ from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.judge import Found
 from nccs_pose.estimation.ledger import Ledger
 from nccs_pose.estimation.many_poses import Poses
+from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
+import pytest
 
 RATIO = 0.85
 AWAY = Objection('it is not there')
@@ -198,3 +200,19 @@ def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_op
         ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
             pose=THERE, support=np.ones(lines), explained=1.0, missing=())))
         assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])
+
+
+@pytest.mark.parametrize(('shown', 'promising'), [
+    (((0.9, 0.8), (0.9, 0.8)), True),
+    (((0.6, 0.9), (0.4, 0.9)), True),
+    (((0.6, 0.9), (0.55, 0.7)), False),
+    (((0.6, 1.0), (0.55, 0.8)), True),
+    (((0.6, 1.0), (0.55, 0.8), (0.5, 0.97)), False),
+    (((0.3, 1.0),), False),
+    ((), False)])
+def test_a_look_is_promising_where_no_other_pose_rivals_the_best(
+    shown: tuple[tuple[float, float], ...], promising: bool,
+) -> None:
+    candidates = tuple(_strips(HERE, *of) for of in shown)
+    sight = Sight(np.zeros((1, 1, 3), np.uint8), (), candidates, Poses.of(()), ())
+    assert sight.is_promising == promising

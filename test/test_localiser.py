@@ -30,6 +30,7 @@ from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.estimation.verdict import objection
 from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
@@ -330,6 +331,34 @@ def test_a_pose_that_is_refused_in_any_case_is_not_laid_to_the_end() -> None:
         hopeless=lambda alignment: not asked.append(alignment))
     assert settled is not None and stopped is asked[0] and len(asked) == 1
     assert stopped.pose != settled.pose
+
+
+def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 0.5))
+    aligner = Aligner(FloorTable(SCENE.rig, DEFAULTS.reach), SCENE.line_map, DEFAULTS)
+    image, start = drive.picture(), drive.pose @ Pose2(0.03, -0.03, 0.015)
+    laid, elsewhere = (aligner.align(
+        image, start, aligner.nominal_colours, reach=5.0, laid=drive.pose @ Pose2(off, 0.0, 0.0))
+        for off in (0.0, 0.2))
+    assert laid is None and elsewhere is not None
+
+
+@pytest.mark.parametrize(('width', 'speaks'), [(0.4, False), (0.8, True)])
+def test_what_surrounds_a_thin_tape_may_shift_it(width: float, speaks: bool) -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 0.5))
+    aligner = Aligner(FloorTable(SCENE.rig, DEFAULTS.reach), SCENE.line_map, DEFAULTS)
+    alignment = aligner.align(
+        drive.picture(), drive.pose, aligner.nominal_colours, reach=2.0)
+    assert alignment is not None
+    line, bands = alignment.lines[0], alignment.bands
+    off = replace(
+        alignment,
+        residual=np.where(
+            alignment.points.label == line, 0.6 / alignment.noise, alignment.residual),
+        bands=replace(bands, half_width=np.where(
+            bands.label == line, 0.5 * width, bands.half_width)))
+    against = objection(off, SCENE.line_map, DEFAULTS, expected=True)
+    assert (against is not None and against.line == line) == speaks
 
 
 def test_the_right_one_of_many_hundreds_of_places_is_told() -> None:
