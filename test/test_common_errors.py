@@ -32,23 +32,25 @@ POSE = np.linalg.qr(np.stack([
     np.where(LABEL == 0, 1.0, 0.0) - np.where(LABEL == 2, 1.0, 0.0),
     np.where(LABEL == 1, 1.0, 0.0) - np.where(LABEL == 3, 1.0, 0.0), ALONG], axis=1))[0]
 LEVERAGE = np.square(POSE).sum(axis=1)
+FIRST = np.arange(0, len(LABEL), 6)
 
 
 def _squared_errors(b: list[float], a: list[float], trials: int = 600) -> tuple[float, float]:
     """Errors that run through the filter b / a along each line, from white noise.
 
-    :returns: mean variance claimed, in units of that of a single error, and the mean square of
-        what a pose takes out, in units of the variance claimed for it; 1 where that is right.
+    :returns: variance claimed, in units of that of a single error (the harmonic mean: it is the
+        inverse that a pose is weighed with), and the mean square of what a pose takes out, in
+        units of the variance claimed for it; 1 where that is right.
     """
     rng, found = np.random.default_rng(3), []
     white = lfilter(b, a, np.eye(1, 200)[0])
     for _ in range(trials):
         error = lfilter(b, a, rng.standard_normal((LINES, 2 * PER_LINE)))[:, PER_LINE:].ravel()
         taken = POSE.T @ error
-        claimed = common_variance(error - POSE @ taken, LEVERAGE, LABEL)
-        found.append((claimed / (white @ white), np.mean(taken**2) / claimed))
-    claimed, nees = np.mean(found, axis=0)
-    return float(claimed), float(nees)
+        claimed = common_variance(error - POSE @ taken, LEVERAGE, LABEL, FIRST)
+        found.append(((white @ white) / claimed, np.mean(taken**2) / claimed))
+    information, nees = np.mean(found, axis=0)
+    return float(1.0 / information), float(nees)
 
 
 def test_independent_errors_are_told_as_such() -> None:
@@ -97,7 +99,7 @@ def test_errors_count_by_what_they_do_to_the_pose(near: float, far: float) -> No
         error = np.where(tells, near, far) * rng.standard_normal(len(LABEL))
         taken = pose.T @ error
         squares.append(np.mean(taken**2) / common_variance(
-            error - pose @ taken, leverage, LABEL))
+            error - pose @ taken, leverage, LABEL, FIRST))
     assert np.mean(squares) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 1800.0))
 
 
@@ -107,13 +109,14 @@ def test_ends_of_two_lines_are_no_neighbours() -> None:
     turned = residual.copy()
     turned[:30] *= -1.0
     # Only products of one line with the other change their sign.
-    assert common_variance(turned, leverage, label) == pytest.approx(
-        common_variance(residual, leverage, label), rel=1e-12)
+    first = np.arange(0, 60, 6)
+    assert common_variance(turned, leverage, label, first) == pytest.approx(
+        common_variance(residual, leverage, label, first), rel=1e-12)
 
 
 def test_few_residuals_are_no_obstacle() -> None:
     label = np.array([0, 1, 1, 2, 2, 2])
-    claimed = common_variance(np.full(6, 0.5), np.full(6, 0.5), label)
+    claimed = common_variance(np.full(6, 0.5), np.full(6, 0.5), label, np.array([0, 1, 3]))
     assert 0.5 < claimed < 6.0
     assert common_misfit(np.full(6, 0.05), label) == 0.0
 

@@ -210,6 +210,21 @@ def test_the_covariance_is_the_scatter(
     assert 2.55 < np.mean(nees) < 3.49
 
 
+def test_errors_of_which_some_are_large_let_the_pose_slide(slide: np.ndarray) -> None:
+    # The more of them stand where their weights fall, the further an error moves the pose.
+    rng = np.random.default_rng(11)
+    nees = []
+    for _ in range(600):
+        size = np.where(rng.random(len(slide)) < 0.2, 0.15, 0.05)
+        shift = size * rng.standard_normal(len(slide))
+        found = solve_shifts(
+            shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
+        error = found.pose.as_array() - POSE.as_array()
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    # 99.9 % band of the mean of 600 chi-squares with three degrees of freedom.
+    assert 2.68 < np.mean(nees) < 3.34
+
+
 def test_the_sigma_told_is_relative(slide: np.ndarray) -> None:
     shift = 0.05 * np.random.default_rng(4).standard_normal(len(slide))
     one = solve_shifts(shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
@@ -233,7 +248,8 @@ def test_what_the_calibration_shifts_no_number_of_stations_averages_out(
         slide: np.ndarray) -> None:
     across = np.random.default_rng(5).normal(size=(len(slide), 2))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    shift = 0.001 * np.random.default_rng(6).standard_normal(len(slide))
+    # Far below the noise told, all weights are one.
+    shift = 0.0001 * np.random.default_rng(6).standard_normal(len(slide))
     sigma = np.full(len(slide), 0.001)
     found = solve_shifts(
         shift, sigma, slide, *_each(len(slide)), POSE, image_shift=across,

@@ -23,57 +23,67 @@ from nccs_pose.vision.bands import in_whole_parts
 import numpy as np
 from numpy.typing import NDArray
 
-# Stations farther apart than this many share little; their products would only add noise.
-_LAGS = 2
-# What the estimate's own uncertainty weighs: one unknown more makes the mean of its inverse right
-# where errors are independent.
-_UNCERTAIN = 1
-# From few stations the correlation is not known; the claim is widened or narrowed no further.
-_LIMIT = 1.2
+# What is alike among neighbours is so among whole lines too, by this power of e times the square
+# of their correlations' sum; from few stations that is not known, and counts to a limit.
+_REDDER = 2.5
+_LIMIT = 0.7
+# A claim from sums fewer than so many would be too uncertain for any correction.
+_LEAST_FREEDOM = 5.0
 # So many neighbours may share one cause of misfit (a block of JPEG, a tile).
 _BLOCK = 4
 
 
-def common_variance(residual: Array, leverage: Array, label: NDArray[np.intp]) -> float:
+def common_variance(
+    residual: Array, leverage: Array, label: NDArray[np.intp], first: NDArray[np.intp],
+) -> float:
     """Variance per station of what the errors of many stations add up to in a fit.
 
     Neighbours err alike where a texture or a block of JPEG spans several, and against each other
-    where the pixels' grid lies on the template in turns. With correlations c_k between stations k
-    apart, the variance of long sums is 1 + 2 (c_1 + c_2 + ...) times that of independent errors.
-    Few of them can be told from noise; exp(2 (c_1 + c_2)) is the same for small ones and stays
-    positive. For large ones it is more: where neighbours have much in common (floors with texture,
-    coarse JPEG), whole lines have too, which the pose takes for its own so that no residual shows
-    it. On simulated images of all kinds squared errors of poses were what it says, to a seventh.
+    where the pixels' grid lies on the template in turns. The sums of whole groups of neighbours
+    hold all of that, however far it reaches within them.
 
     Errors weigh what they do in the fit. A near tape tells most of a pose, and compared with the
     noise told it may err more than a far one (coarse JPEG, whose far tapes are all template) or
     less (a texture seen finely): the mean over all stations would be that of the far ones, which
     are many.
 
-    What the fit takes out of the residuals is what they have in common: the stations' leverage,
-    times this variance, from each square and each product. A little more stands for the
-    uncertainty of the estimate, which makes the inverse of a covariance too large on average.
+    What the fit takes out of the residuals is what they have in common: of a group's square as
+    much as the group moves its own fit, its stations' leverage together. Sums few in number make
+    the inverse of a covariance too large on average; F of them by F / (F - 2).
+
+    Errors that are alike farther than a group reaches hide in the pose, which takes for its own
+    what whole lines have in common. They go with such as show: floors with texture and coarse
+    JPEG have both. With correlations c_k between stations k apart, on simulated images of all
+    kinds, sums over lines had about exp(2.5 (c_1 + c_2)^2) times the variance of sums over groups.
 
     :param residual: of the stations (N,), whitened, along each line in order.
-    :param leverage: how far each one's error moves its own fit (N,), from 0 to 1.
+    :param leverage: how far each one's error moves its own fit (N,), from 0 to 1; 0 of one that
+        has no part in it.
     :param label: line (N,), ascending.
-    :returns: 1 for independent errors as large as told; from exp(-2.4) to exp(2.4) times what
-        independent errors of their size would come to.
+    :param first: station of each group (G,), ascending from 0; no group is of two lines.
+    :returns: 1 for independent errors as large as told.
     """
-    fitted = max(float(leverage.sum()), 1e-12)
+    weighed = np.empty((2, len(residual)))
+    error = np.sqrt(leverage, out=weighed[0])
+    error *= residual
+    weighed[1] = leverage
+    sums, shares = np.add.reduceat(weighed, first, axis=1)
+    fitted, shared = max(float(shares.sum()), 1e-12), _square(shares)
+    left = max(fitted - shared, 0.0)
     taken = float(leverage.dot(leverage)) / fitted
-    weighed = residual * np.sqrt(leverage)
-    variance = max(_square(weighed) / (fitted * max(1.0 - taken, 1e-12)), 1e-12)
-    shown = 0.0
-    for lag in range(1, _LAGS + 1):
-        along = (label[lag:] == label[:-lag]).astype(float)
-        products = float((weighed[lag:] * weighed[:-lag]).dot(along))
-        shown += products / max(float(leverage[lag:].dot(along)), 1e-12) / variance
-    taken *= _LAGS * (1.0 + _UNCERTAIN / fitted)
-    correlation = shown
-    for _ in range(2):
-        correlation = min(shown + taken * math.exp(2.0 * correlation), _LIMIT)
-    return variance * math.exp(2.0 * max(correlation, -_LIMIT))
+    variance = max(_square(error) / (fitted * max(1.0 - taken, 1e-12)), 1e-12)
+    freedom = max(fitted * left / max(shared, 1e-24), _LEAST_FREEDOM)
+    # One group more, of independent errors: what few groups say is not all.
+    own = fitted / len(first)
+    together = (_square(sums) + own * variance) / (left + own) * freedom / (freedom - 2.0)
+    # Of three neighbours the first with the two others.
+    along = (label[2:] == label[:-2]).astype(float)
+    products = float((error[1:-1] + error[2:]).dot(error[:-2] * along))
+    shown = products / max(float(leverage[:-2].dot(along)), 1e-12)
+    alike = min(max((shown + 2.0 * taken * together) / variance, 0.0), _LIMIT)
+    # Less what independent errors of so many stations show by chance.
+    beyond_chance = max(alike**2 - 2.0 * taken / fitted, 0.0)
+    return together * math.exp(_REDDER * beyond_chance)
 
 
 def common_misfit(offset: Array, label: NDArray[np.intp]) -> float:

@@ -34,10 +34,14 @@ from numpy.typing import NDArray
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
 _CAUCHY = 2.385
-# Beyond this many robust standard deviations a station is no inlier; what lies within has this
-# much of a Gaussian's variance.
+# Beyond this many robust standard deviations a group of stations is no inlier.
 _GATE = 3.0
-_WITHIN_GATE = 0.9733
+# Tukey's biweight forgets what lies beyond this many, and keeps 98 % of the efficiency under
+# Gaussian noise. No group weighs nothing at all, so that no sum is empty.
+_FORGOTTEN = 6.0
+_NOTHING = 1e-6
+# A fit is held by this part of its weights at least.
+_LEAST_HELD = 0.3
 _ITERATIONS = 8
 # The robust stage only has to find the inliers. After a step below this, in squared deviations of
 # the pose, the next is about a fifth of it, and moves no group's residual by as much as a tenth of
@@ -64,10 +68,16 @@ def solve_shifts(
     """Weigh N measured shifts into one step of the pose.
 
     Re-weighted least squares under Cauchy's loss with its scale estimated from the residuals,
-    then least squares over the inliers, from which the covariance comes; ``sigma`` is taken for
+    then a step under Tukey's biweight, from which the covariance comes; ``sigma`` is taken for
     relative there, its scale comes from the residuals and from what neighbours have in common.
     What is robustly weighted is the sum of neighbours' residuals: what disturbs a stretch of line
     disturbs all of it, and shows in the sum before it shows in any one.
+
+    A weight that falls pulls a fit on as it moves: an error moves it 1 / (1 - s) times as far as
+    it would with the weights held, where 1 - s is the mean of psi' over that of the weights. So
+    the variance of an M-estimate is E psi^2 / (E psi')^2. A gate's fall cannot be measured from
+    the few groups that stand at it, and is steep where errors are no Gaussian's (coarse JPEG, a
+    floor with texture: up to half of the variance); the biweight's is a mean over all of them.
 
     :param shift: of the stations (N,), px.
     :param sigma: their standard deviations (N,), px.
@@ -87,24 +97,25 @@ def solve_shifts(
     np.divide(shift, sigma, out=rows[-1])
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
-    unknowns, trusted = _robust(
-        np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
-    inlier = trusted.repeat(members)
-    at, = inlier.nonzero()
-    inliers = rows.take(at, axis=1)
-    squares = inliers.dot(inliers.T)
+    square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
+    inlier = (square <= _GATE**2).repeat(members)
+    # Times the root of the weight.
+    root = np.maximum(1.0 - square / _FORGOTTEN**2, _NOTHING).repeat(members)
+    weighed = rows * root
+    squares = weighed.dot(weighed.T)
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
-    e = _residual(inliers, unknowns)
-    one = _ONE[:len(free), :len(free)]
-    leverage = (
-        definite_solution(normal + known, one).dot(inliers[:-1]) * inliers[:-1]).sum(axis=0)
-    inflation = max(common_variance(e, leverage, label.take(at)) / _WITHIN_GATE, 1e-6)
-    covariance = definite_solution(normal / inflation + known, one)
+    fitted = definite_solution(normal + known, _ONE[:len(free), :len(free)])
+    e = _residual(weighed, fitted.dot(right + told))
+    leverage = (fitted.dot(weighed[:-1]) * weighed[:-1]).sum(axis=0)
+    # Of the biweight, psi' over the weight is 5 - 4 / root.
+    held = max(5.0 - 4.0 * leverage.dot(1.0 / root) / max(leverage.sum(), 1e-12), _LEAST_HELD)
+    inflation = max(common_variance(e, leverage, label, first) / held**2, 1e-6)
+    covariance = definite_solution(normal / inflation + known, _ONE[:len(free), :len(free)])
     unknowns = covariance @ (right / inflation + told)
     if calibration_sigma > 0.0 and image_shift is not None:
-        moved = image_shift[inlier] / sigma[inlier, None]
-        answer = covariance @ (inliers[:-1] @ moved) * (calibration_sigma / inflation)
+        moved = image_shift * (root / sigma)[:, None]
+        answer = covariance @ (weighed[:-1] @ moved) * (calibration_sigma / inflation)
         covariance = covariance + answer @ answer.T
     step = np.zeros(6)
     step[free] = unknowns
@@ -115,15 +126,13 @@ def solve_shifts(
         _residual(rows, unknowns), inlier, True)
 
 
-def _robust(
-    equations: Array, known: Array, told: Array,
-) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+def _robust(equations: Array, known: Array, told: Array) -> Array:
     """Re-weighted least squares under Cauchy's loss.
 
     :param equations: whitened, by unknowns and what they should come to (K + 1, G).
     :param known: information about the unknowns beforehand (K, K), and times what they are
         expected to be, ``told`` (K,).
-    :returns: the unknowns (K,), and which equations are inliers (G,).
+    :returns: squares of the equations' residuals, in those of robust standard deviations (G,).
     """
     unknowns: NDArray[np.floating] = np.zeros(len(told))
     e = equations[-1]
@@ -139,8 +148,9 @@ def _robust(
         step = unknowns - before
         if step.dot(normal).dot(step) < _FOUND:
             break
-    square = e * e
-    return unknowns, square <= _GATE**2 * _robust_variance(square)
+    square = np.square(e, dtype=float)
+    square /= _robust_variance(square)
+    return square
 
 
 def _prior(
