@@ -172,8 +172,9 @@ def test_the_pose_is_saved_while_driving_and_the_file_is_always_whole(robots, dr
         # Replaced, not written over: whoever has opened the file still reads what it was.
         before.seek(0)
         assert before.read() == text
-    np.testing.assert_array_equal(
-        read_saved_pose(path).pose.as_array(), robot.answer(stamps[-1]))
+    # The message holds a quaternion: its rounding is all that they may differ by.
+    np.testing.assert_allclose(
+        read_saved_pose(path).pose.as_array(), robot.answer(stamps[-1]), rtol=0.0, atol=1e-15)
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
