@@ -33,8 +33,8 @@ import numpy as np
 # A pose that leaves more of the strips unexplained than another by this much is no rival of it:
 # where a coarse image seemed to show a wrong pose, the right one explained as much or more.
 AS_MUCH = 0.05
-# Nor is one that shows less than this part of it, on the image and by strips: of wrong poses that
-# seemed right on a coarse image nearly all showed less than this and the right one more.
+# Nor is one that shows less than this part of what it shows, on the image and by strips: of wrong
+# poses that seemed right on a coarse image all but one of 88 had a rival that showed more.
 ABOUT_AS_MUCH = 0.9
 
 

@@ -43,7 +43,7 @@ _NOTHING = 1e-6
 # A fit is held by this part of its weights at least.
 _LEAST_HELD = 0.3
 _ITERATIONS = 8
-# The robust stage only has to find the inliers. After a step below this, in squared deviations of
+# The robust stage only has to find the weights. After a step below this, in squared deviations of
 # the pose, the next is about a fifth of it, and moves no group's residual by as much as a tenth of
 # its own.
 _FOUND = 1.0
@@ -105,13 +105,14 @@ def solve_shifts(
     squares = weighed.dot(weighed.T)
     normal, right = squares[:-1, :-1], squares[:-1, -1]
     # The prior's share is weighed against residuals of the size that they have.
-    fitted = definite_solution(normal + known, _ONE[:len(free), :len(free)])
+    one = _ONE[:len(free), :len(free)]
+    fitted = definite_solution(normal + known, one)
     e = _residual(weighed, fitted.dot(right + told))
     leverage = (fitted.dot(weighed[:-1]) * weighed[:-1]).sum(axis=0)
     # Of the biweight, psi' over the weight is 5 - 4 / root.
     held = max(5.0 - 4.0 * leverage.dot(1.0 / root) / max(leverage.sum(), 1e-12), _LEAST_HELD)
     inflation = max(common_variance(e, leverage, label, first) / held**2, 1e-6)
-    covariance = definite_solution(normal / inflation + known, _ONE[:len(free), :len(free)])
+    covariance = definite_solution(normal / inflation + known, one)
     unknowns = covariance @ (right / inflation + told)
     if calibration_sigma > 0.0 and image_shift is not None:
         moved = image_shift * (root / sigma)[:, None]
