@@ -80,11 +80,10 @@ class Process:
             self._popen.wait()
             raise
 
-    def kill(self) -> None:
-        """End it, whatever it does."""
+    def tell_to_end(self) -> None:
+        """Ask it to end, if it still runs."""
         if self.running():
-            self._popen.kill()
-            self._popen.wait()
+            self._popen.terminate()
 
     @property
     def output(self) -> str:
@@ -222,7 +221,11 @@ class World:
         return self.start('localiser', *arguments)
 
     def close(self) -> None:
-        """End everything."""
+        """End everything, in order: who is killed leaves its shared memory, 35 MB, behind."""
         for process in self._processes:
-            process.kill()
-        self.user.close()
+            process.tell_to_end()
+        try:
+            for process in self._processes:
+                process.wait()
+        finally:
+            self.user.close()
