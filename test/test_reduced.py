@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene
 from nccs_pose.vision.colour import LineColour
@@ -156,3 +156,22 @@ def test_coarse_images_that_speak_for_two_poses_give_no_wrong_one(seed: int, k: 
         return
     assert np.hypot(estimate.pose.x - pose.x, estimate.pose.y - pose.y) < 0.05
     assert abs(wrap_angle(estimate.pose.yaw - pose.yaw)) < np.radians(1.0)
+
+
+@pytest.mark.parametrize('height', [0.0, 0.0005, 0.0011])
+def test_three_lines_hold_no_pose_where_the_fourth_is_seen_beside_its_place(
+    height: float,
+) -> None:
+    """A pose 0.13 m off, on which three lines lie, and the fourth two pixels from its place."""
+    scene = ideal_scene(640, 0.02)
+    stands = dataclasses.replace(
+        scene, sensor=dataclasses.replace(scene.sensor, jpeg_quality=20),
+        rig=dataclasses.replace(scene.rig, T_base_mirror=RigidTransform.from_rpy(
+            (0.0, 0.0, 0.0), (0.0, 0.0, height)) @ scene.rig.T_base_mirror))
+    rng = np.random.default_rng([707, 58])
+    pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
+    estimate = Localiser(scene.rig, scene.line_map).process(0, render(stands, pose, rng))
+    if estimate.pose is None:
+        assert estimate.reason
+        return
+    assert np.hypot(estimate.pose.x - pose.x, estimate.pose.y - pose.y) < 0.03

@@ -51,6 +51,8 @@ _CAPTURED = 1.0
 # A tape this wide, px, of which this part is found in its place is there.
 _PLAIN_WIDTH = 1.0
 _PLAIN_SHARE = 0.8
+# One that should be as wide as this, px, is found in its place if it is there.
+_FOUND_WIDTH = 0.7
 # What is thinner than this, px, is outshone by what surrounds it.
 _LEAST_WIDTH = 0.31
 # Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
@@ -110,13 +112,17 @@ def placement(
     if confirmed and width >= _PLAIN_WIDTH and found >= _PLAIN_SHARE * len(bands):
         return Placement(confirmed=True)
     scale = bands.half_width / (0.5 * line_map[line].width)
-    shift = _strongest(image, bands, moved, colour, reach, scale)
+    least = max(_BESIDE, DISTURBED / width)
+    # Profiles would find so wide a tape, were it in its place.
+    absent = found < _LEAST_STATIONS and width >= _FOUND_WIDTH
+    captured = least if absent else _CAPTURED
+    shift = _strongest(image, bands, moved, colour, reach, scale, captured)
     if shift is None:
         return Placement()
-    if float(np.mean(np.abs(shift))) <= _CAPTURED:
+    if float(np.mean(np.abs(shift))) <= captured:
         if found < _LEAST_STATIONS:
             return Placement()
-        if off <= max(_BESIDE, DISTURBED / width, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
+        if off <= max(least, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
             return Placement(confirmed=confirmed)
         shift = np.full(len(bands), mean)
     if width < _LEAST_WIDTH or _on_another(line, bands, shift + moved, alignment, line_map, table):
@@ -141,7 +147,7 @@ def _mean_and_deviation(value: Array, weight: Array) -> tuple[float, float]:
 
 def _strongest(
     image: NDArray[np.uint8], bands: Bands, moved: Array, colour: LineColour, reach: float,
-    scale: Array,
+    scale: Array, captured: float,
 ) -> Array | None:
     """Shifts (N,), px, at which a line as a whole is seen best; None where it is not seen.
 
@@ -149,6 +155,7 @@ def _strongest(
     together: the contrast of the whole line is laid out over where it may lie on the floor.
 
     :param scale: of the image across the line (N,), px per metre.
+    :param captured: what lies further off than this, px, must show more there than in its place.
     """
     usual = upper_median(scale)
     farthest = min(_NEAR, reach / usual)
@@ -176,7 +183,7 @@ def _strongest(
     better, certain = _mean_and_deviation(here[best] - own, weight[best])
     if not max(_CONTRAST[0], _EVIDENT * noise) < level < _CONTRAST[1]:
         return None
-    if offset > _CAPTURED:
+    if offset > captured:
         if better < max(_BETTER[0], _BETTER[1] * certain):
             return None
         # What is seen in its place, and is not the blur of what is beside it, is the line.
