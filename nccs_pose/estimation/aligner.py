@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 from nccs_pose.estimation.alignment import Alignment, alignment_of, close, Pass
 from nccs_pose.estimation.options import LocaliserOptions
@@ -36,6 +37,11 @@ from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 SPACING = 2.0
+# They are chosen for poses so far apart, m and rad: one in between sees those of the nearest about
+# as evenly spaced, and a robot has moved so little in most images that it needs no others. So many
+# choices are remembered, as it may stand where two meet.
+_CHOSEN_APART = (0.25, 0.4)
+_REMEMBERED = 4
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
 # first, rough pass takes one station of so many. On more curve than this, px, these few show what
 # tapes look like as well, and a second pass takes some too. A search takes so many of each line,
@@ -78,6 +84,7 @@ class Aligner:
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
         self._predictor = BandPredictor(table, line_map)
+        self._chosen = lru_cache(_REMEMBERED)(self._choose)
         self._lines = len(line_map)
         self._options = options
         names = tuple(dict.fromkeys(line.colour for line in line_map))
@@ -114,14 +121,13 @@ class Aligner:
             if searched is None or (laid is not None and _near(searched, laid)):
                 return None
             pose = searched
-        places = self._predictor.places(pose, SPACING, self._options.stations)
+        places = self._places(pose)
         if len(places) < _LEAST_STATIONS:
             return None
         begun = self._begun(image, places, pose, prior, colours, reach)
         if begun is None:
             return None
         pose, attitude, colours = begun
-        result: Alignment | None = None
         for k in range(_ITERATIONS):
             measured = self._measure(
                 image, places, pose, prior, colours, attitude, rough=False)
@@ -131,7 +137,6 @@ class Aligner:
             result = alignment_of(measured, self._lines)
             if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
                 return None
-            step = result.pose.minus(pose)
             sharpest, steady = _sharpest(colours), _is_steady(known, colours)
             settled = steady and (
                 measured.moved < _SETTLED_BLURS * sharpest or close(
@@ -139,15 +144,28 @@ class Aligner:
             # The first pass learns what tapes look like, and may miss what the next one finds.
             if hopeless is not None and k > 0 and steady and measured.moved < _NEARLY:
                 settled = settled or hopeless(result)
-            pose, attitude = result.pose, result.refinement.attitude
+            before, pose, attitude = pose, result.pose, result.refinement.attitude
             if settled:
                 return result
             if measured.moved > _MOVED_PX:
-                places = self._predictor.places(pose, SPACING, self._options.stations)
-        if result is None or np.abs(step).max() > _LAST_STEP:
+                places = self._places(pose)
+        step = pose.minus(before)
+        if np.abs(step).max() > _LAST_STEP:
             return None
         # Stations that come and go near their thresholds can keep it stepping to and fro.
         return replace(result, covariance=result.covariance + np.outer(step, step))
+
+    def _places(self, pose: Pose2) -> Places:
+        """Stations for a pose, chosen for the nearest pose of a lattice."""
+        metres, radians = _CHOSEN_APART
+        return self._chosen(
+            round(pose.x / metres), round(pose.y / metres), round(pose.yaw / radians))
+
+    def _choose(self, column: int, row: int, turn: int) -> Places:
+        metres, radians = _CHOSEN_APART
+        return self._predictor.places(
+            Pose2(metres * column, metres * row, radians * turn), SPACING,
+            self._options.stations)
 
     def _begun(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
