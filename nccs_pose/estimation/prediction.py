@@ -42,13 +42,6 @@ _GAPS = 256
 # So many stations at most, on all lines together.
 _MOST = 1500
 _LEVEL = np.zeros(3)
-# The terms of an expansion by the direction of a line: by which powers of it they go, and what the
-# pixel, its derivatives ahead on the line and to its left, the second ones (ahead, twice the
-# mixed one, to the left), and the first one a quarter turn on are of them.
-_TURNS = np.array([0, 1, -1, 2, 0, -2])
-_TO_LINE = np.array([
-    [1, 0, 0, 0, 0, 0], [0, 1, 1, 0, 0, 0], [0, 1j, -1j, 0, 0, 0],
-    [0, 0, 0, 1, 2, 1], [0, 0, 0, 2j, 0, -2j], [0, 0, 0, -1, 2, -1], [0, 1j, 1j, 0, 0, 0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +80,6 @@ class BandPredictor:
         self._direction = as_complex(line_map.directions[self._lines, :2])
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        self._powers = self._direction ** _TURNS[:, None]
         # Half width, half its square, length, parts (see _GAPS) per metre, the first of them and
         # direction to the left, by rows.
         self._tapes = np.array([
@@ -154,25 +146,29 @@ class BandPredictor:
         number, distance = places.number, places.distance
         turn = _turned_back(pose)
         origin = (self._start - complex(pose.x, pose.y)) * turn
-        turns = (self._powers * (turn ** _TURNS)[:, None]).take(number, axis=1)
-        ahead = turns[1]
+        ahead = (self._direction * turn).take(number)
+        back = ahead.conj()
         middle = origin.take(number) + distance * ahead
         if any(attitude.tolist()):
             middle = as_complex(self._table.met(*_leant(as_points(middle), attitude)))
         image = self._table.expand(middle)
-        # How the pixel goes as the point goes ahead on the line, and to its left.
-        along = _TO_LINE.dot(image.terms * turns)
-        pixels, by_ahead, _, twice_ahead, twice_mixed, twice_left, beside = along
+        # The terms of a step ahead on the line, 2 V for V. To its left, i times as far, P and Q
+        # bring in i and -i, U and W -1.
+        pixels, p, q, u, v, w = image.terms
+        p, q, u, v, w = p * ahead, q * back, u * (ahead * ahead), 2.0 * v, w * (back * back)
+        by_ahead, twice = p + q, u + w
+        twice_ahead, twice_mixed, twice_left = v + twice, 2j * (u - w), v - twice
         speed = np.abs(by_ahead)
-        turned, bent = along[2:4] / by_ahead
+        # Against how the pixel goes ahead, how it goes to the left, less i, and how it bends.
+        turned, bent = (p - q) / by_ahead, twice_ahead / by_ahead
         tapes = self._tapes.take(number, axis=1)
         (half, half_square, length, gaps_per_metre, first_gap), left = tapes[:5], tapes[5:]
         # The cut across the tape whose image is normal to the curve leans along the line.
-        lean = -turned.real
-        gain = np.abs(turned.imag) * speed
+        lean = turned.imag
+        gain = np.abs(turned.real) * speed
         # One over the speed, negative where the image is reflected.
-        slowness = np.copysign(1.0, turned.imag) / speed
-        across = slowness * beside
+        slowness = np.copysign(1.0, turned.real) / speed
+        across = 1j * slowness * by_ahead
         bend = slowness * bent.imag
         # The two edges lie unequally far from the midline: a matter of the second order.
         centre = as_points(pixels + half_square * (
@@ -188,7 +184,7 @@ class BandPredictor:
         # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
         # along its line does not count.
         slide = np.empty((6, len(number)))
-        against, back = -gain, ahead.conj()
+        against = -gain
         np.multiply(against, left, out=slide[:2])
         np.multiply(against, (back * middle).real, out=slide[2])
         # Floor that sinks by dz is seen where the ray would have met it, further out.
