@@ -35,6 +35,7 @@ from nccs_pose.geometry.small_matrices import (
     inverse,
     inverse_2x2,
     inverse_3x3,
+    is_definite,
     solution,
     solve_3x3,
     solved,
@@ -398,7 +399,9 @@ def test_only_positive_definite_matrices_are_solved(sizes, negative, seed):
     definite = not any(negative)
     for matrix in (m, np.diag(values)):
         assert (solved(matrix, g) is not None) == definite
-        assert (inverse_3x3(matrix) is not None) == definite
+        assert (inverse_3x3(matrix) is not None) == is_definite(matrix) == definite
+        assert is_definite(matrix, values.min() - 1e-3)
+        assert not is_definite(matrix, values.min() + 1e-3)
         # LAPACK takes over.
         assert matrix @ solution(matrix, g) == pytest.approx(g, rel=1e-6, abs=1e-9)
         assert matrix @ inverse(matrix) == pytest.approx(np.eye(3), abs=1e-8)

@@ -167,14 +167,19 @@ class FloorLine:
         return along, np.abs(off) - half_strip(width, self.footprint(points.spread))
 
 
-def misplaced(points: FloorPoints, normals: Array, offsets: Array, width: float) -> Array:
+def misplaced(
+    points: FloorPoints, normals: Array, offsets: Array, of: NDArray[np.intp], width: float,
+) -> Array:
     """Whether each point is none of a tape's on a line of its own (P,).
 
-    :param normals: of the lines (P, 2).
-    :param offsets: likewise (P,), metres.
+    :param normals: of lines (K, 2).
+    :param offsets: likewise (K,), metres.
+    :param of: the line of each point (P,).
     """
-    off = np.einsum('pi,pi->p', points.floor[:, :2], normals) - offsets
-    square = np.einsum('pi,pi->p', points.spread, squares(normals) * [1.0, 2.0, 1.0])
+    by_floor = np.column_stack([normals, -offsets]).take(of, axis=0)
+    by_spread = (squares(normals) * [1.0, 2.0, 1.0]).take(of, axis=0)
+    off = np.einsum('pi,pi->p', points.floor, by_floor)
+    square = np.einsum('pi,pi->p', points.spread, by_spread)
     return np.abs(off) > half_strip(width, np.sqrt(square))
 
 

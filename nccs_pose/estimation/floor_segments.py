@@ -182,7 +182,7 @@ def _candidates(
     number = np.cumsum(begins) - 1
     size = np.bincount(number)
     own, own_offset, _ = principal_lines(np.add.reduceat(points.moments, first))
-    off = misplaced(points, own[number], own_offset[number], width)
+    off = misplaced(points, own, own_offset, number, width)
     misfit = np.add.reduceat(off.astype(float), first) / size
     speck = size < _LEAST_LINE
     tangled = ~speck & (size >= _LEAST_PIXELS) & (misfit > _MISFIT)

@@ -195,8 +195,7 @@ class Judge:
         score, claimed = (strips.score, strips.claimed) if strips is not None else (
             self._searcher.score(alignment.pose, segments))
         return Found(
-            alignment, claimed, shown(score, alignment) * fit_of(
-                float(np.mean(alignment.points.sigma**2))),
+            alignment, claimed, shown(score, alignment) * fit_of(alignment.points.variance),
             score)
 
 
@@ -235,7 +234,7 @@ def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float
 
 def lines_shown(alignment: Alignment) -> frozenset[int]:
     """The lines that a pose shows in their places, most of each."""
-    return frozenset((alignment.support >= _WEAK).nonzero()[0].tolist())
+    return frozenset(k for k, part in enumerate(alignment.support.tolist()) if part >= _WEAK)
 
 
 def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:

@@ -23,7 +23,7 @@ import math
 
 from nccs_pose.errors import FrameRefusedError
 from nccs_pose.geometry.pose import Array, Pose2, wrapped
-from nccs_pose.geometry.small_matrices import inverse, inverse_3x3
+from nccs_pose.geometry.small_matrices import inverse, is_definite
 import numpy as np
 
 # Odometry further from a stamp than this says nothing about it, ns.
@@ -101,7 +101,7 @@ class Prediction:
         gain = solved.dot(self.information)
         multiple = max(1.0, float(covariance.trace() / solved.trace()))
         narrowed = covariance - gain.dot(multiple * self.covariance - self.carried).dot(gain.T)
-        return covariance if inverse_3x3(narrowed) is None else narrowed
+        return narrowed if is_definite(narrowed) else covariance
 
 
 FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])

@@ -35,7 +35,7 @@ import math
 from nccs_pose.estimation.general_lines import ALIGNED
 from nccs_pose.estimation.pose_monomials import feet_in_plan
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.small_matrices import inverse_2x2, solve_3x3
+from nccs_pose.geometry.small_matrices import inverse_2x2, is_definite
 import numpy as np
 
 # Two lines of a map written by hand are parallel, or meet, when they do so up to this (rad, m).
@@ -137,10 +137,7 @@ def unobserved_directions(
     :param limit: a direction is unobserved when its standard deviation, in metres and radians
         alike, is larger than this.
     """
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = information.tolist()
-    least = 1.0 / (limit * limit)
-    if solve_3x3(xx - least, xy, yy - least, xz, yz, zz - least, 0.0, 0.0, 0.0) is not None:
-        # What remains is positive definite: all eigenvalues are larger than that.
+    if is_definite(information, 1.0 / (limit * limit)):
         return ()
     values, vectors = np.linalg.eigh(information)
     found = []

@@ -318,4 +318,4 @@ class Sifter:
 
 def _is_sharp(alignment: Alignment) -> bool:
     """Whether lines lie so well on the image that it shows by itself where they are."""
-    return fit_of(float(np.mean(alignment.points.sigma**2))) > _SHARP
+    return fit_of(alignment.points.variance) > _SHARP

@@ -61,7 +61,7 @@ class Objection:
 def lines_used(alignment: Alignment) -> int:
     """How many lines a pose rests on."""
     # A line out of view has no support: NaN is not as large as anything.
-    return int(np.count_nonzero(alignment.support >= _RESTS))
+    return sum(part >= _RESTS for part in alignment.support.tolist())
 
 
 def objection(

@@ -66,6 +66,13 @@ def solved(matrix: Array, right: Array) -> Array | None:
     return None if found is None else np.array(found)
 
 
+def is_definite(matrix: Array, least: float = 0.0) -> bool:
+    """Whether all eigenvalues of a symmetric matrix (3, 3) are larger, beyond rounding."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrix.tolist()
+    return solve_3x3(
+        xx - least, xy, yy - least, xz, yz, zz - least, 0.0, 0.0, 0.0) is not None
+
+
 def definite_solutions(matrices: Array, right: Array) -> Array:
     """Solutions (H, 3) of systems (H, 3, 3) that are positive definite, far beyond rounding."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrices.transpose(1, 2, 0)
@@ -76,7 +83,7 @@ def definite_solutions(matrices: Array, right: Array) -> Array:
     share = b / a
     z = (last - b * second) / (c - share * b)
     y = second - share * z
-    return np.stack([first - one * y - other * z, y, z], axis=1)
+    return np.array([first - one * y - other * z, y, z]).T
 
 
 def solution(matrix: Array, right: Array) -> Array:

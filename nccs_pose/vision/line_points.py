@@ -49,6 +49,11 @@ class LinePoints:
         if not math.isfinite(np.vdot(self.pixels, self.pixels) + np.vdot(self.sigma, self.sigma)):
             raise VisionError('line points: pixels and sigma must be finite')
 
+    @property
+    def variance(self) -> float:
+        """Mean square of :attr:`sigma`, px^2."""
+        return float(self.sigma.dot(self.sigma)) / len(self)
+
     def __len__(self) -> int:
         return len(self.pixels)
 

@@ -106,7 +106,8 @@ def raised_mask(
     side = max(_LEAST_SQUARE, round(_SQUARE * window)) | 1
     opened = cv2.morphologyEx(feature, cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     around = cv2.max(cv2.blur(feature, (window, window)), cv2.min(opened, usual))
-    some = feature[::4, ::4].astype(np.int16) - around[::4, ::4]
+    # Of numbers shorter than 32 bits numpy finds the median in twice the time.
+    some = feature[::4, ::4].astype(np.int32) - around[::4, ::4]
     noise = 1.4826 * upper_median(np.abs(some - int(upper_median(some))))
     threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
