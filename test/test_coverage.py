@@ -20,10 +20,11 @@ import math
 
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation import coverage
-from nccs_pose.evaluation.coverage import run_scenario, Scenario
+from nccs_pose.evaluation.coverage import coverage_table, Covered, run_scenario, Scenario
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.scene import ideal_scene
+import numpy as np
 import pytest
 from scipy.stats import chi2
 
@@ -46,3 +47,23 @@ def test_a_floor_more_uneven_than_told_is_not(monkeypatch: pytest.MonkeyPatch) -
     covered = run_scenario(UNEVEN, TRIALS, seed=2)
     assert covered.verdict == 'too sure'
     assert covered.consistency.mean_nees * TRIALS > 10.0 * chi2.ppf(0.9999, 3 * TRIALS)
+
+
+def test_scenarios_err_independently() -> None:
+    named = [Scenario(name, lambda: ideal_scene(640, 0.02)) for name in ('a', 'b')]
+    a, b = (run_scenario(scenario, 3, seed=2).error for scenario in named)
+    assert np.abs(a - b).min() > 0.0
+    np.testing.assert_array_equal(a, run_scenario(named[0], 3, seed=2).error)
+
+
+def test_the_last_row_is_all_answers_together() -> None:
+    # Errors of one sigma in each direction of 30 trials, of two in each of 10.
+    rows = [
+        Covered(Scenario(name, ideal_scene), trials, np.full((count, 3), size),
+                np.tile(np.eye(3), (count, 1, 1)))
+        for name, trials, count, size in (('good', 40, 30, 1.0), ('bad', 20, 10, 2.0))]
+    last = [cell.strip() for cell in coverage_table(rows).splitlines()[-1].split('|')[1:-1]]
+    low, high = chi2.ppf([0.025, 0.975], 120) / 40
+    assert last == [
+        'all', '40 of 60', f'{(30 * 3 + 10 * 12) / 40:.2f}', f'{low:.2f} to {high:.2f}',
+        '0.750', '1.000', '1.000', '', '', 'too sure']
