@@ -67,3 +67,12 @@ def test_the_last_row_is_all_answers_together() -> None:
     assert last == [
         'all', '40 of 60', f'{(30 * 3 + 10 * 12) / 40:.2f}', f'{low:.2f} to {high:.2f}',
         '0.750', '1.000', '1.000', '', '', 'too sure']
+
+
+def test_wheels_are_as_uncertain_in_every_trial() -> None:
+    # Three of four tapes gone, most images are refused: the pose is carried on by the wheels.
+    one = Scenario('one line', lambda: ideal_scene(640, 0.02), seen=('west',))
+    yaw_sigma = np.sqrt(run_scenario(one, 6, seed=2).covariance[:, 2, 2])
+    carried = yaw_sigma[yaw_sigma > 0.005]
+    assert len(carried) >= 3
+    np.testing.assert_allclose(carried, carried[0], rtol=1e-3)

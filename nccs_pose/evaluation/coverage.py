@@ -19,8 +19,8 @@ Every trial is a fresh image of a random pose on a floor of its own, searched fr
 errors are independent and the bands of chi-square hold. What the localiser is told to know only
 so well, the height of its mirror and where asked the slope of the floor, is drawn as uncertain
 as it is told. Where the lines in view do not fix a pose, the trial is two images: one that does,
-and then, an odometry step later, the one in question; the wheels err as the localiser expects
-them to.
+and then, an odometry step later, the one in question; the step is as far from what the wheels
+tell as the localiser expects.
 
 Every scenario draws poses and noise of its own: were they shared, twenty rows would be outside
 their bands by the same chance, and all answers together would tell no more than one row.
@@ -49,7 +49,7 @@ import numpy as np
 
 _SPREAD = (0.9, 0.6)
 _FRAME_NS = 100_000_000
-# The step of the robot between two images, m, m and rad.
+# The step of the robot between two images, as its wheels tell it, m, m and rad.
 _MOTION = (0.05, 0.0, 0.03)
 _PEOPLE = 3
 # So many trials share a height and a slope: the renderer's tables of a mounting take longer than
@@ -215,18 +215,18 @@ def _second_image(
     rng: np.random.Generator,
 ) -> tuple[Pose2, Estimate]:
     """The true pose and the estimate of an image that follows one with all lines."""
-    step = Pose2(*_MOTION)
-    # An error of the wheels as likely as the localiser takes it for.
-    expected = by_odometry(pose, np.zeros((3, 3)), Pose2(0.0, 0.0, 0.0), step)
-    measured = Pose2.from_array(rng.multivariate_normal(
-        (pose @ step).as_array(), expected.carried))
+    told = pose @ Pose2(*_MOTION)
+    # What is expected goes by the step that wheels tell, so it is the true one that is drawn: if
+    # they erred from a true step, those that tell too little would be thought too exact.
+    expected = by_odometry(pose, np.zeros((3, 3)), pose, told)
+    there = Pose2.from_array(rng.multivariate_normal(told.as_array(), expected.carried))
     localiser.add_odometry(-_FRAME_NS, pose)
     localiser.add_odometry(0, pose)
     localiser.process(0, render(scene, pose, rng))
-    localiser.add_odometry(_FRAME_NS, measured)
+    localiser.add_odometry(_FRAME_NS, told)
     kept = LineMap(tuple(line for line in scene.line_map if line.name in seen))
-    image = render(dataclasses.replace(scene, line_map=kept), pose @ step, rng)
-    return pose @ step, localiser.process(_FRAME_NS, image)
+    image = render(dataclasses.replace(scene, line_map=kept), there, rng)
+    return there, localiser.process(_FRAME_NS, image)
 
 
 def coverage_table(rows: list[Covered]) -> str:
