@@ -386,6 +386,7 @@ def test_what_surrounds_a_thin_tape_may_shift_it(width: float, speaks: bool) -> 
         alignment,
         residual=np.where(
             alignment.points.label == line, 0.6 / alignment.noise, alignment.residual),
+        offset=np.where(alignment.offset_label == line, 0.6, alignment.offset),
         bands=replace(bands, half_width=np.where(
             bands.label == line, 0.5 * width, bands.half_width)))
     against = objection(off, SCENE.line_map, DEFAULTS, expected=True)

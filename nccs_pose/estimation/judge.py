@@ -115,8 +115,9 @@ class Judge:
         found = objection(alignment, self._map, self._options, expected=expected)
         # Out of nothing every line in view is looked at, else those that leave a question.
         least = _WEAK if expected else np.inf
-        asked = {*(alignment.support < least).nonzero()[0].tolist(),
-                 *(k for k in doubts if alignment.support[k] >= 0.0)}
+        support = alignment.support.tolist()
+        asked = {*(k for k, part in enumerate(support) if part < least),
+                 *(k for k in doubts if support[k] >= 0.0)}
         if found is not None or not asked:
             return found
         asked -= plainly_in_place(alignment)

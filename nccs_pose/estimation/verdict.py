@@ -76,17 +76,18 @@ def objection(
         return Objection(
             f'only {100.0 * alignment.explained:.0f} % of the predicted line pixels are there')
     most = options.largest_misfit
-    # No stretch lies farther off than one of its groups.
-    if np.abs(alignment.offset).max() > most and alignment.misfit > most:
-        return Objection(
-            f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not fit the '
-            'image')
-    off = _line_off(alignment, len(line_map), most)
-    if off is not None:
-        k, offset = off
-        return Objection(
-            f'{_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not fit '
-            'the image', line=k)
+    # Neither a stretch nor a line lies farther off than one of its groups.
+    if np.abs(alignment.offset).max() > most:
+        if alignment.misfit > most:
+            return Objection(
+                f'whole lines lie {alignment.misfit:.1f} px off: the rig or the map does not fit '
+                'the image')
+        off = _line_off(alignment, len(line_map), most)
+        if off is not None:
+            k, offset = off
+            return Objection(
+                f'{_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not fit '
+                'the image', line=k)
     used = lines_used(alignment)
     scale, size = alignment.scale, alignment.residual_px
     times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
