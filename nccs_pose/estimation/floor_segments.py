@@ -44,6 +44,9 @@ _LEAST_PIXELS = 10
 _LEAST_SAMPLES = 8
 # Fewer than this to start from hardly ever grow to so many.
 _LEAST_START = 7
+# Of two lines that start from so large a part of the same points one is enough to see whether
+# they run on.
+_ALIKE = 0.8
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
@@ -129,26 +132,22 @@ def floor_segments(
     counts = np.array([points.weight, free], np.float32)
     support, starts = (counts @ near).astype(float)
     segments: list[FloorSegment] = []
-    futile: set[bytes] = set()
     while len(segments) < most:
         support[starts < _LEAST_START] = -np.inf
         best = int(support.argmax())
         if support[best] < _LEAST_PIXELS:
             break
-        support[best] = -np.inf
         start, = ((near[:, best] > 0.0) & free).nonzero()
-        # Many lines through one small thing start from the very same points.
-        if start.tobytes() in futile:
-            continue
         strip = _strip(points, free, start, width)
-        if strip is None:
-            futile.add(start.tobytes())
+        if strip is None or strip.length < _LEAST_LENGTH:
+            # Nor does any line run on that starts from nearly the same points, or from points of
+            # a thing so short alone.
+            common = near[start].sum(axis=0)
+            support[common >= _ALIKE * np.maximum(starts, len(start))] = -np.inf
+            if strip is not None:
+                support[starts == near[strip.inside].sum(axis=0)] = -np.inf
             continue
-        if strip.length < _LEAST_LENGTH:
-            # Nor does any line run on that starts from points of a thing so short alone.
-            support[starts == near[strip.inside].sum(axis=0)] = -np.inf
-            continue
-        futile.clear()
+        support[best] = -np.inf
         beside = strip.beside(points)
         if _stands_free(points, strip, beside, width):
             taken = _one_tape(points, strip.along, strip.inside, longest)
