@@ -64,8 +64,8 @@ class Searcher:
 
     :ivar first: the way to find the strips of an image that suffices for most.
     :ivar further: ways for the others, in groups that take turns from image to image. Each look
-        takes the strips found before and what the tapes were thought to look like, and gives its
-        own of both.
+        takes the image as of :meth:`view`, the strips found before and what the tapes were
+        thought to look like, and gives its own of both.
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
@@ -91,41 +91,46 @@ class Searcher:
 
     def segments(self, image: NDArray[np.uint8]) -> Strips:
         """Straight strips of the map's colours on the floor, the largest first."""
-        part = self._view.read(image)
+        return self._by_pixels(self.view(image))
+
+    def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What of an image (H, W, 3) all looks take, (h, w, 3): its floor, made smaller."""
+        return self._view.read(image)
+
+    def _by_pixels(self, part: NDArray[np.uint8]) -> Strips:
         return self._strips({colour: self._mask(part, colour) for colour in self._widths})
 
     def _first_look(
-        self, image: NDArray[np.uint8], _: Strips, colours: Colours,
+        self, part: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
-        return self.segments(image), colours
+        return self._by_pixels(part), colours
 
     def _look_along(
-        self, image: NDArray[np.uint8], _: Strips, colours: Colours,
+        self, part: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look for what is no pixel's matter: lines, by all that they run over."""
-        part = self._view.read(image)
         return self._strips({
             colour: self._faint(contrast_of(part, colour)) for colour in self._widths}), colours
 
     def _look_by_example(
-        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+        self, part: NDArray[np.uint8], known: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look for what looks like the strips that are known."""
         options = self._options
-        return self._by_example(image, known, colours, self._mask, lambda part, seen: raised_mask(
+        return self._by_example(part, known, colours, self._mask, lambda part, seen: raised_mask(
             feature_of(part, seen), brightness(part), options.noise_gate, options.least_contrast,
             self._window))
 
     def _look_along_by_example(
-        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+        self, part: NDArray[np.uint8], known: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look along lines for what looks like the strips that are known."""
         return self._by_example(
-            image, known, colours, lambda part, name: self._faint(contrast_of(part, name)),
+            part, known, colours, lambda part, name: self._faint(contrast_of(part, name)),
             lambda part, seen: self._faint(feature_of(part, seen)))
 
     def _by_example(
-        self, image: NDArray[np.uint8], known: Strips, colours: Colours,
+        self, part: NDArray[np.uint8], known: Strips, colours: Colours,
         unseen: Callable[[NDArray[np.uint8], str], Mask],
         mask_of: Callable[[NDArray[np.uint8], LineColour], Mask],
     ) -> tuple[Strips, Colours]:
@@ -134,7 +139,6 @@ class Searcher:
         :param unseen: mask of a colour, by its class, of which none is.
         :param mask_of: of one that was learned.
         """
-        part = self._view.read(image)
         learned = []
         for colour in colours:
             examples = [strip.pixels for strip in known if strip.colour == colour.name]

@@ -102,8 +102,9 @@ def sights(
     further = groups[in_vain % len(groups)] if groups else ()
     best: Sight | None = None
     tried: list[Sight] = []
+    view = searcher.view(image)
     for look in (searcher.first, *further):
-        segments, shown = look(image, best.segments if best is not None else (), colours)
+        segments, shown = look(view, best.segments if best is not None else (), colours)
         if best is not None and segments is best.segments:
             continue
         lap('detect')
