@@ -113,16 +113,16 @@ def placement(
         return Placement(confirmed=True)
     scale = bands.half_width / (0.5 * line_map[line].width)
     least = max(_BESIDE, DISTURBED / width)
-    # Profiles would find so wide a tape, were it in its place.
-    absent = found < _LEAST_STATIONS and width >= _FOUND_WIDTH
-    captured = least if absent else _CAPTURED
+    # Profiles say where a tape is that is near; and would so wide a one, were it in its place.
+    near = found >= _LEAST_STATIONS and off <= 2.0 * _CAPTURED
+    captured = least if not near and width >= _FOUND_WIDTH else _CAPTURED
     shift = _strongest(image, bands, moved, colour, reach, scale, captured)
     if shift is None:
         return Placement()
     if float(np.mean(np.abs(shift))) <= captured:
-        if found < _LEAST_STATIONS:
+        if not near:
             return Placement()
-        if off <= max(least, _EVIDENT * deviation) or off > 2.0 * _CAPTURED:
+        if off <= max(least, _EVIDENT * deviation):
             return Placement(confirmed=confirmed)
         shift = np.full(len(bands), mean)
     if width < _LEAST_WIDTH or _on_another(line, bands, shift + moved, alignment, line_map, table):
