@@ -37,9 +37,9 @@ from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 SPACING = 2.0
-# They are chosen for poses so far apart, m and rad: one in between sees those of the nearest about
-# as evenly spaced, and a robot has moved so little in most images that it needs no others. So many
-# choices are remembered, as it may stand where two meet.
+# To follow a robot they are chosen for poses so far apart, m and rad: one in between sees those of
+# the nearest about as evenly spaced, and a robot has moved so little in most images that no others
+# are needed. So many choices are remembered, as it may stand where two meet.
 _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
@@ -121,7 +121,7 @@ class Aligner:
             if searched is None or (laid is not None and _near(searched, laid)):
                 return None
             pose = searched
-        places = self._places(pose)
+        places = self._places(pose) if reach > 0.0 else self._places_near(pose)
         if len(places) < _LEAST_STATIONS:
             return None
         begun = self._begun(image, places, pose, prior, colours, reach)
@@ -156,16 +156,18 @@ class Aligner:
         return replace(result, covariance=result.covariance + np.outer(step, step))
 
     def _places(self, pose: Pose2) -> Places:
-        """Stations for a pose, chosen for the nearest pose of a lattice."""
+        """Stations for a pose, chosen for it."""
+        return self._predictor.places(pose, SPACING, self._options.stations)
+
+    def _places_near(self, pose: Pose2) -> Places:
+        """The same, chosen for the nearest pose of a lattice."""
         metres, radians = _CHOSEN_APART
         return self._chosen(
             round(pose.x / metres), round(pose.y / metres), round(pose.yaw / radians))
 
     def _choose(self, column: int, row: int, turn: int) -> Places:
         metres, radians = _CHOSEN_APART
-        return self._predictor.places(
-            Pose2(metres * column, metres * row, radians * turn), SPACING,
-            self._options.stations)
+        return self._places(Pose2(metres * column, metres * row, radians * turn))
 
     def _begun(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
