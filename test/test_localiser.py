@@ -349,8 +349,7 @@ def test_a_robot_on_its_way_needs_new_stations_now_and_then_only(
 def test_a_pose_that_is_refused_in_any_case_is_not_laid_to_the_end() -> None:
     drive = Drive(SCENE, Pose2(0.3, -0.2, 0.5))
     aligner = Aligner(FloorTable(SCENE.rig, DEFAULTS.reach), SCENE.line_map, DEFAULTS)
-    # From so far off that the first pass does not end at the pose.
-    image, start = drive.picture(), drive.pose @ Pose2(0.04, -0.04, 0.02)
+    image, start = drive.picture(), drive.pose @ Pose2(0.03, -0.03, 0.015)
     settled = aligner.align(image, start, aligner.nominal_colours, reach=2.0)
     asked: list[Alignment] = []
     stopped = aligner.align(
