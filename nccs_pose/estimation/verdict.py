@@ -76,7 +76,8 @@ def objection(
         return Objection(
             f'only {100.0 * alignment.explained:.0f} % of the predicted line pixels are there')
     most = options.largest_misfit
-    # Neither a stretch nor a line lies farther off than one of its groups.
+    # Neither a stretch nor a line lies farther off than one of its groups, but for a hundredth or
+    # two where noise differs within a group.
     if np.abs(alignment.offset).max() > most:
         if alignment.misfit > most:
             return Objection(
