@@ -24,19 +24,14 @@ from typing import Protocol
 
 from nccs_pose.errors import FrameRefusedError
 from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.evaluation.pose_error import PoseError
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.drive import ImageSample
 from nccs_pose.simulation.faults import Fault, prepare, Rehearsal
 import numpy as np
-
-# Closer than both of these is right, whatever the covariance says.
-RIGHT_DISTANCE = 0.05
-RIGHT_ANGLE = math.radians(1.0)
-# Standard deviations (of the error as a whole) that a pose may be off by its own covariance.
-RIGHT_SIGMAS = 5.0
 
 
 class Answering(Protocol):
@@ -81,26 +76,14 @@ class FaultRow:
 
 @dataclass(frozen=True)
 class _Answer:
-    """One image's outcome: errors in m and rad, NaN without a pose; sigmas off."""
+    """What became of an image; `error` is None where the localiser would not use it."""
 
     after: bool
-    refused: bool = False
-    distance: float = math.nan
-    angle: float = math.nan
-    sigmas: float = math.nan
-
-    @property
-    def given(self) -> bool:
-        return not math.isnan(self.distance)
+    error: PoseError | None
 
     @property
     def right(self) -> bool:
-        return self.given and self.distance <= RIGHT_DISTANCE and self.angle <= RIGHT_ANGLE
-
-    @property
-    def wrong(self) -> bool:
-        # A covariance that is none (not finite) excuses nothing.
-        return self.given and not self.right and not self.sigmas <= RIGHT_SIGMAS
+        return self.error is not None and self.error.right
 
 
 def run_fault(
@@ -129,31 +112,23 @@ def _answer(localiser: Answering, sample: ImageSample, after: bool) -> _Answer:
     try:
         estimate = localiser.process(sample.stamp_ns, sample.image)
     except FrameRefusedError:
-        return _Answer(after, refused=True)
-    if estimate.pose is None or estimate.covariance is None:
-        return _Answer(after)
-    error = estimate.pose.as_array() - sample.pose.as_array()
-    error[2] = wrap_angle(error[2])
-    try:
-        squared = float(error @ np.linalg.solve(estimate.covariance, error))
-    except np.linalg.LinAlgError:
-        squared = math.nan
-    sigmas = math.sqrt(squared) if squared >= 0.0 else math.nan
-    return _Answer(after, False, math.hypot(error[0], error[1]), abs(float(error[2])), sigmas)
+        return _Answer(after, None)
+    return _Answer(after, PoseError.of(estimate, sample.pose))
 
 
 def _count(fault: Fault, answers: Sequence[_Answer]) -> FaultRow:
-    given = [answer for answer in answers if answer.given]
+    looked_at = [answer.error for answer in answers if answer.error is not None]
+    given = [error for error in looked_at if error.given]
     after = [answer.right for answer in answers if answer.after]
     return FaultRow(
         fault,
         frames=len(answers),
         answered=len(given),
-        wrong=sum(answer.wrong for answer in answers),
-        refused=sum(answer.refused for answer in answers),
+        wrong=sum(error.wrong for error in given),
+        refused=len(answers) - len(looked_at),
         recovered=after.index(True) + 1 if any(after) else None,
-        worst_distance=max((answer.distance for answer in given), default=math.nan),
-        worst_angle=max((answer.angle for answer in given), default=math.nan),
+        worst_distance=max((error.distance for error in given), default=math.nan),
+        worst_angle=max((error.angle for error in given), default=math.nan),
     )
 
 
