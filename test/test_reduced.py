@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
@@ -151,6 +152,25 @@ def test_coarse_images_that_speak_for_two_poses_give_no_wrong_one(seed: int, k: 
             scene.appearance, texture=dataclasses.replace(texture, seed=1000 + k)))
     rng = np.random.default_rng([seed, k])
     pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
+    estimate = Localiser(scene.rig, scene.line_map).process(0, render(scene, pose, rng))
+    _right_or_none(estimate, pose, 0.05)
+
+
+@pytest.mark.parametrize('k', [117, 168, 259, 370, 374])
+def test_a_pose_that_explains_a_coarse_image_is_none_where_another_explains_it_better(
+    k: int,
+) -> None:
+    """Images 320 px wide, tapes half like the floor: half a turn round nearly all is explained."""
+    scene = arena_scene(320)
+    look = scene.appearance
+    green = 0.5 * (np.array(look.floor_colour) + np.array(look.line_colours['green']))
+    scene = dataclasses.replace(scene, appearance=dataclasses.replace(
+        look, room=None, obstacles=(), line_colours={'green': tuple(green)}))
+    rng = np.random.default_rng([7, zlib.crc32(b'f'), k])
+    ends = np.concatenate((scene.line_map.starts, scene.line_map.ends))[:, :2]
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    x, y = 0.5 * (low + high) + rng.uniform(-0.25, 0.25, 2) * (high - low)
+    pose = Pose2(float(x), float(y), rng.uniform(-np.pi, np.pi))
     estimate = Localiser(scene.rig, scene.line_map).process(0, render(scene, pose, rng))
     _right_or_none(estimate, pose, 0.05)
 

@@ -33,7 +33,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.told import Told
-from nccs_pose.estimation.verdict import misses_lines, Objection
+from nccs_pose.estimation.verdict import lines_used, misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
@@ -48,8 +48,8 @@ _SEARCH_BAND = 5.0
 _WORTH_TRYING = 0.75
 # An image on which lines lie as well as this shows by itself which of two poses is right.
 _SHARP = 0.8
-# So does a pose that explains more than this of what should be seen and of what is, unless another
-# that lies on it was refused.
+# On others how well lines lie tells only those apart that explain more than this of what should be
+# seen and of what is, by three lines or more, and no more where one that lies on it was refused.
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
@@ -280,16 +280,18 @@ class Sifter:
         On an image so coarse that lines lie badly on it how well they lie says little, and what a
         pose shows of strips and lines has to stand out among those that lie on it, and where the
         map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
-        pose has to show all the lines that should be in view. Where the image decides nothing
-        there is no doubt.
+        pose has to show all the lines that should be in view. One that explains nearly all, which
+        leaves little to stand out by, is in doubt only where another lies as well. Where the image
+        decides nothing there is no doubt.
         """
         if isinstance(found, Objection) or expected:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
-        plain = min(found.claimed, alignment.explained) > _PLAINLY_ALL and not ledger.has_refused
-        if plain or _is_sharp(alignment):
+        if _is_sharp(alignment):
             return found
-        if alignment.missing:
+        plain = (lines_used(alignment) > 2 and not ledger.has_refused
+                 and min(found.claimed, alignment.explained) > _PLAINLY_ALL)
+        if alignment.missing and not plain:
             return _INCOMPLETE
         if case.told is None and self._has_many_equals(found, candidates):
             return found
@@ -298,20 +300,28 @@ class Sifter:
             _Start.of(c) for c in candidates
             if c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
                 c.pose, alignment.pose))
+        least_score = self._options.ambiguity_ratio * found.score if plain else 0.0
         doubted = any(
-            self._shows_as_much(case, rival, found)
+            self._shows_as_much(case, rival, found, least_score)
             for rival in chain(rivals, self._taken_for(case, alignment)))
         return _DOUBTFUL if doubted else found
 
-    def _shows_as_much(self, case: Case, rival: _Start, found: Found) -> bool:
-        """Whether a rival shows about as much, laid on the image, as a pose that holds."""
+    def _shows_as_much(
+        self, case: Case, rival: _Start, found: Found, least_score: float,
+    ) -> bool:
+        """Whether a rival shows about as much, laid on the image, as a pose that holds.
+
+        :param least_score: that it has to reach besides, for how well its lines lie.
+        """
         least = ABOUT_AS_MUCH * found.shown
         for reach in rival.reaches:
             # What tapes look like is known by now.
             alignment = self._aligner.align(
                 case.sight.image, rival.pose, found.alignment.colours, reach=reach)
-            if alignment is not None and self._measured(
-                    case.sight, rival, alignment).shown >= least:
+            if alignment is None or same_pose(alignment.pose, found.alignment.pose):
+                continue
+            measured = self._measured(case.sight, rival, alignment)
+            if measured.shown >= least and measured.score >= least_score:
                 return True
         return False
 
