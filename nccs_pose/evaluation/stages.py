@@ -30,7 +30,7 @@ from typing import Any
 
 import cv2
 from nccs_pose.errors import OptionError
-from nccs_pose.estimation.estimate import StageTimes
+from nccs_pose.estimation.estimate import Estimate, StageTimes
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.pose import Array, Pose2
@@ -139,7 +139,7 @@ def _run(
         localiser.add_odometry(_stamp(k), poses[k])
         if mode == SEARCHING:
             localiser.relocalise()
-        run.append(_timed(localiser, k, images[k]))
+        run.append(_frame(localiser, k, images[k]))
         progress(mode)
     return run
 
@@ -148,20 +148,32 @@ def _stamp(k: int) -> int:
     return round(k / _RATE * 1e9)
 
 
-def _timed(localiser: Localiser, k: int, image: NDArray[np.uint8]) -> _Frame:
-    """One frame, and the threshold pass as the mean of one before and one after it."""
+def timed(
+    localiser: Localiser, stamp_ns: int, image: NDArray[np.uint8],
+) -> tuple[Estimate, float, float]:
+    """Give an image to a localiser.
+
+    :returns: its answer; the processor's time of it, s, and of the threshold pass as the mean of
+        one before and one after it.
+    """
     times = [time.thread_time()]
     threshold_pass(image)
     times.append(time.thread_time())
-    estimate = localiser.process(_stamp(k), image)
+    estimate = localiser.process(stamp_ns, image)
     times.append(time.thread_time())
     threshold_pass(image)
     times.append(time.thread_time())
     before, frame, after = np.diff(times).tolist()
+    return estimate, frame, 0.5 * (before + after)
+
+
+def _frame(localiser: Localiser, k: int, image: NDArray[np.uint8]) -> _Frame:
+    """One frame of the drive."""
+    estimate, frame, threshold = timed(localiser, _stamp(k), image)
     # The localiser's stages are by the clock: what they share in is the processor's time.
     share = frame / max(estimate.times.total, 1e-9)
     return _Frame(
-        0.5 * (before + after), frame,
+        threshold, frame,
         [share * getattr(estimate.times, stage) for stage in STAGES], estimate.pose is not None)
 
 

@@ -1,0 +1,116 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""First poses, counted map by map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nccs_pose.cli import main
+from nccs_pose.estimation.estimate import Candidate, Estimate, State
+from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
+from nccs_pose.geometry.pose import Pose2
+from nccs_pose.simulation.scene import arena_map
+import numpy as np
+import pytest
+
+FAR = Pose2(30.0, 0.0, 0.0)
+
+
+def test_maps_are_as_large_and_as_alike_as_they_say() -> None:
+    by_name = {place.name: place.line_map for place in PLACES}
+    assert {len(line_map) for name, line_map in by_name.items() if 'arena' not in name} == {50}
+    turns = {name: len(map_symmetries(line_map)) for name, line_map in by_name.items()}
+    # The identity; half a turn; quarter turns.
+    assert turns == {
+        'arena': 1, 'arena, faint tapes': 1, 'scattered': 1, 'scattered, dense': 1,
+        'parking bays': 2, 'dashes': 2, 'lattice': 4}
+
+
+def test_in_the_arena_every_image_gives_the_pose() -> None:
+    starts = run_starts(PLACES[0], 640, 4)
+    assert starts.states == {State.TRACKING: 4}
+    assert (starts.wrong, starts.without) == (0, 0)
+    assert len(starts.cost) == len(starts.threshold) == 4
+    assert min(starts.cost.min(), starts.threshold.min()) > 0.0
+
+
+@pytest.mark.parametrize(('answer', 'wrong', 'without'), [
+    (Estimate(0, State.TRACKING, '', FAR, np.diag((1e-4, 1e-4, 1e-4))), 3, 0),
+    (Estimate(0, State.TRACKING, '', FAR, np.diag((1e6, 1e6, 1e6))), 0, 0),
+    (Estimate(0, State.AMBIGUOUS, '', candidates=(Candidate(FAR, 1.0),)), 0, 3),
+    (Estimate(0, State.SEARCHING, ''), 0, 0)])
+def test_what_is_wrong_is_counted(
+    answer: Estimate, wrong: int, without: int, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Localiser, 'process', lambda *_: answer)
+    starts = run_starts(Place('arena', arena_map()), 160, 3)
+    assert (starts.wrong, starts.without) == (wrong, without)
+    assert starts.states == {answer.state: 3}
+    row = [cell.strip() for cell in starts_table([starts]).splitlines()[-1].split('|')[1:-1]]
+    counts = (answer.state is State.TRACKING, answer.state is State.AMBIGUOUS)
+    assert row[:9] == ['arena', '4', '160', '3', *(
+        str(n) for n in (3 * counts[0], wrong, 3 * counts[1], without, 3 - 3 * sum(counts)))]
+
+
+def test_the_true_pose_is_looked_for_among_several(monkeypatch: pytest.MonkeyPatch) -> None:
+    true: list[Pose2] = []
+    reset = Pose2(0.0, 0.0, 0.0)
+
+    def render(scene: Any, pose: Pose2, rng: np.random.Generator) -> np.ndarray:
+        true.append(pose)
+        return np.zeros((120, 160, 3), np.uint8)
+
+    def process(*_: Any) -> Estimate:
+        near = true[-1] @ replace(reset, x=0.1)
+        return Estimate(0, State.AMBIGUOUS, '', candidates=(
+            Candidate(FAR, 1.0), Candidate(near, 0.9)))
+
+    monkeypatch.setattr('nccs_pose.evaluation.starts.render', render)
+    monkeypatch.setattr(Localiser, 'process', process)
+    starts = run_starts(Place('arena', arena_map()), 160, 5)
+    assert starts.without == 0
+    assert starts.states == {State.AMBIGUOUS: 5}
+    # All within the middle half of what the map spans.
+    x, y = np.array([(pose.x, pose.y) for pose in true]).T
+    assert np.abs(x).max() < 1.0 and np.abs(y).max() < 0.8 and np.ptp(x) > 0.1
+
+
+def test_the_command(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture,
+) -> None:
+    output = tmp_path / 'starts.md'
+    words = ['starts', '--trials', '1', '--widths', '320', '--output', str(output)]
+    assert main([*words, '--map', str(repository / 'config' / 'soccer_map.yaml'),
+                 '--option', 'reach=9.0']) == 0
+    printed = capsys.readouterr().out
+    assert 'soccer_map |    17 | 320' in printed
+    assert output.read_text(encoding='utf-8') in printed
+    assert main(['starts', '--list']) == 0
+    assert capsys.readouterr().out.split('\n')[:2] == ['arena', 'arena, faint tapes']
+    for wrong, said in (
+            (['nowhere'], 'no place is called like nowhere'), (['--widths', '642'], '642'),
+            (['--option', 'reach=9.0'], '--map')):
+        assert main(['starts', *wrong]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_a_wrong_pose_is_the_commands_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = Estimate(0, State.TRACKING, '', FAR, np.diag((1e-4, 1e-4, 1e-4)))
+    monkeypatch.setattr(Localiser, 'process', lambda *_: answer)
+    assert main(['starts', 'faint', '--trials', '1', '--widths', '160']) == 1
