@@ -55,6 +55,8 @@ _PLAINLY_ALL = 0.9
 _AS_LAID = (0.03, 0.01)
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
+_ON_A_CORNER = Objection(
+    'it rests on two lines, and the image shows as much of another pose', hidden=True)
 _INCOMPLETE = Objection(
     'its lines lie badly on the image, and others that should be in view are not there',
     hidden=True)
@@ -192,7 +194,7 @@ class Sifter:
         alignment, found = verdict
         if isinstance(found, Found):
             return found
-        if found is _DOUBTFUL:
+        if found in (_DOUBTFUL, _ON_A_CORNER):
             ledger.doubt(found, self._measured(case.sight, start, alignment))
         elif found.hidden:
             ledger.hide(found, self._measured(case.sight, start, alignment))
@@ -281,30 +283,44 @@ class Sifter:
         pose shows of strips and lines has to stand out among those that lie on it, and where the
         map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
         pose has to show all the lines that should be in view. One that explains nearly all, which
-        leaves little to stand out by, is in doubt only where another lies as well. Where the image
+        leaves little to stand out by, is in doubt only where another lies as well. Two lines lie
+        well on any corner, and what shows a rival may be too little to lay it on. Where the image
         decides nothing there is no doubt.
         """
         if isinstance(found, Objection) or expected:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
-        if _is_sharp(alignment):
+        sharp, few = _is_sharp(alignment), lines_used(alignment) < 3
+        if sharp and not few:
             return found
-        plain = (lines_used(alignment) > 2 and not ledger.has_refused
-                 and min(found.claimed, alignment.explained) > _PLAINLY_ALL)
-        if alignment.missing and not plain:
+        plain = not few and not ledger.has_refused and (
+            min(found.claimed, alignment.explained) > _PLAINLY_ALL)
+        if alignment.missing and not (plain or sharp):
             return _INCOMPLETE
         if case.told is None and self._has_many_equals(found, candidates):
             return found
-        least = self._options.ambiguity_ratio * found.by_strips
-        rivals = (
-            _Start.of(c) for c in candidates
-            if c.score >= least and c.claimed > found.claimed - AS_MUCH and not same_pose(
-                c.pose, alignment.pose))
+        rivals = self._rivals(found, candidates)
+        if few and rivals:
+            return _ON_A_CORNER
+        if sharp:
+            return found
         least_score = self._options.ambiguity_ratio * found.score if plain else 0.0
         doubted = any(
             self._shows_as_much(case, rival, found, least_score)
             for rival in chain(rivals, self._taken_for(case, alignment)))
         return _DOUBTFUL if doubted else found
+
+    def _rivals(self, found: Found, candidates: Sequence[FittedCandidate]) -> list[_Start]:
+        """Those of which the strips show as much as of a pose that holds."""
+        least = self._options.ambiguity_ratio * found.by_strips
+        return [
+            _Start.of(c) for c in candidates
+            if c.score >= least and c.claimed > found.claimed - AS_MUCH
+            and not self._are_alike(c.pose, found.alignment.pose)]
+
+    def _are_alike(self, a: Pose2, b: Pose2) -> bool:
+        """Whether two poses are the same, or twins on a symmetric map, which no image parts."""
+        return any(same_pose(a, twin) for twin in (b, *(s @ b for s in self._symmetries)))
 
     def _shows_as_much(
         self, case: Case, rival: _Start, found: Found, least_score: float,
@@ -318,7 +334,7 @@ class Sifter:
             # What tapes look like is known by now.
             alignment = self._aligner.align(
                 case.sight.image, rival.pose, found.alignment.colours, reach=reach)
-            if alignment is None or same_pose(alignment.pose, found.alignment.pose):
+            if alignment is None or self._are_alike(alignment.pose, found.alignment.pose):
                 continue
             measured = self._measured(case.sight, rival, alignment)
             if measured.shown >= least and measured.score >= least_score:
