@@ -96,6 +96,22 @@ def test_a_shift_put_in_is_measured(half_width: float, angle: float) -> None:
         assert np.abs(fit.shift - shift).max() < 0.15
 
 
+def test_no_template_is_computed_where_numbers_lose_their_digits(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    # There a processor takes dozens of times as long.
+    exp, powers = cv2.exp, []
+
+    def noted(power: np.ndarray, out: np.ndarray) -> np.ndarray:
+        powers.append(np.abs(power).max())
+        return exp(power, out)
+
+    monkeypatch.setattr(cv2, 'exp', noted)
+    sharp = replace(_colour(), blur=0.4)
+    fit, _ = fit_profiles(_tape(8.0, 0.1), _straight_bands(8.0, 0.1, 0.2), sharp)
+    assert float(np.median(fit.shift)) == pytest.approx(0.2, abs=0.05)
+    assert max(powers) < 80.0
+
+
 def test_a_tape_along_the_rows_is_biased_by_its_place_between_them_at_most_a_little() -> None:
     # All stations then read between the pixels in the same way, and do not average out.
     for half_width in (0.3, 0.6, 1.2, 3.0, 6.0):

@@ -31,6 +31,9 @@ from numpy.typing import NDArray
 
 # At most so many pixels of a station are looked for across.
 _MOST_ACROSS = 31
+# So many blurs from an edge its blur is nothing. A processor is slow with numbers so small or
+# so large that they lose digits, as farther out it would be.
+_BLURRED = 9.0
 
 
 def read_pixels(
@@ -108,10 +111,11 @@ def profile_products(
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(s.T, 1.0 / blur, out=place)
+    np.multiply(cv2.transpose(s), 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
+    edges.clip(-_BLURRED, _BLURRED, out=edges)
     np.square(edges, out=square)
     # The logistic function of a cubic is the normal distribution to 0.0003.
     np.multiply(square, -0.0713548, out=rise)
