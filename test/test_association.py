@@ -22,7 +22,7 @@ import itertools
 from nccs_pose.estimation.association import Associator
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
-from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.many_poses import Poses, same_pose
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines
 from nccs_pose.estimation.symmetries import map_symmetries
@@ -304,6 +304,17 @@ def test_where_many_hundreds_of_places_are_equal_all_are_told(table: FloorTable)
         turn = Pose2(10.0, 10.0, turns * np.pi / 2.0) @ Pose2(-10.0, -10.0, 0.0)
         place = Pose2(float(i), float(j), 0.0) @ turn @ pose
         assert any(_near(other, place, 0.25, 0.1) for other in told)
+
+
+def test_what_thousands_of_poses_explain_is_what_each_does(table: FloorTable) -> None:
+    rng = np.random.default_rng(3)
+    lines = _random_map(rng, 12)
+    strips = _strips(lines, Pose2(0.2, -0.1, 0.4), rng)
+    scorer = Associator(lines, table)._scorer(strips)
+    poses = Poses.of([Pose2(*rng.uniform(-2.0, 2.0, 3)) for _ in range(700)])
+    alone = [float(scorer.claimed(poses[[k]])[0]) for k in range(700)]
+    assert scorer.claimed(poses) == pytest.approx(np.array(alone), abs=1e-12)
+    assert len(scorer.claimed(poses[[]])) == 0
 
 
 def test_one_strip_across_many_heavier_ones_is_enough(table: FloorTable) -> None:

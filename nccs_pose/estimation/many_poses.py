@@ -43,7 +43,9 @@ class Poses:
         x, y, yaw = np.array([(pose.x, pose.y, pose.yaw) for pose in poses]).reshape(-1, 3).T
         return cls(np.exp(1j * yaw), x + 1j * y)
 
-    def __getitem__(self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int]) -> Poses:
+    def __getitem__(
+        self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int] | slice,
+    ) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
     def and_on_by(self, step: Pose2) -> Poses:
