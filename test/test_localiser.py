@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 import itertools
 import math
@@ -27,9 +27,12 @@ from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.aligner import Aligner, SPACING
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.estimate import Estimate, State
+import nccs_pose.estimation.localiser as localiser_module
 from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.verdict import objection
 from nccs_pose.files.yaml_files import load_map
@@ -310,6 +313,41 @@ def test_where_many_places_look_the_same_one_of_them_is_laid_on_an_image(
         # From bay to bay the hall looks the same, either way round.
         assert len(estimate.candidates) >= 20
         assert len(laid) == 1
+
+
+def test_what_was_refused_at_one_look_is_not_laid_at_the_next(
+        laid: list[Pose2], monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = list(SCENE.line_map)
+    shift = np.array([0.15, 0.0, 0.0])
+    wrong = replace(lines[1], start=lines[1].start + shift, end=lines[1].end + shift)
+    drive = Drive(SCENE, Pose2(0.0, 0.0, 0.4), believed=LineMap((lines[0], wrong, *lines[2:])))
+    look, align, count = localiser_module.sights, Aligner.align, []
+
+    def missing(*place: Any, **options: Any) -> Alignment | None:
+        """As if one more line should be in view, which other colours might show."""
+        alignment = align(*place, **options)
+        return alignment and replace(alignment, missing=(2,))
+
+    monkeypatch.setattr(Aligner, 'align', missing)
+
+    def twice(*place: Any) -> Iterator[Sight]:
+        for sight in look(*place):
+            yield from (sight, sight)
+
+    def with_its_like(*place: Any) -> Iterator[Sight]:
+        for sight in look(*place):
+            yield from (sight, replace(sight))
+
+    for sights in (look, twice, with_its_like):
+        monkeypatch.setattr(localiser_module, 'sights', sights)
+        drive.localiser.reset()
+        drive.pictures = 0
+        laid.clear()
+        estimate = drive.go()
+        assert estimate.pose is None and estimate.doubted is not None
+        near = [pose for pose in laid if same_pose(pose, estimate.doubted.pose)]
+        count.append((len(laid), len(near)))
+    assert count[1] == count[0] and count[2][1] == count[0][1] > 0
 
 
 def test_a_pose_that_holds_speaks_for_its_twins(laid: list[Pose2]) -> None:

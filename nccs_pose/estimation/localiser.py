@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
@@ -40,14 +41,14 @@ from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
-from nccs_pose.estimation.ledger import Refused
+from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sifting import Case, Sifter
-from nccs_pose.estimation.sights import sights
+from nccs_pose.estimation.sights import Sight, sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
@@ -202,14 +203,16 @@ class Localiser:
         """Look for every pose that explains the image, and take the one that is left, if any."""
         hypotheses = carried(self._open, self._open_odometry, self._now)
         told = self._told(prediction)
-        refusals: list[Refused] = []
+        looks: dict[Sight, Sifted] = {}
         for sight in sights(
                 image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
             segments = sight.segments
-            sifted = self._sifter.sift(
-                Case(sight, self._doubts, prediction, told, refusals), hypotheses)
+            # Another try of the same would come to the same.
+            if sight not in looks:
+                looks[sight] = self._sifter.sift(
+                    Case(sight, self._doubts, prediction, told, looks), hypotheses)
+            sifted = looks[sight]
             watch.lap('measure')
-            refusals += sifted.refused
             # What was tried early is no place to be alone in.
             if sifted.held and (
                     sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
@@ -226,8 +229,8 @@ class Localiser:
             if trusted is not None:
                 return self._tracking(
                     stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
-            if refused.objection is None and refusals:
-                refused = refusals[0]
+            if refused.objection is None:
+                refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
         chosen = the_one_expected(held, sifted.open, told, prediction, self.options)
         if chosen is not None:

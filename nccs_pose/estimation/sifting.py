@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import chain, islice
 
@@ -106,14 +106,20 @@ class Case:
     :ivar told: where the robot is by something else than the image, which can decide between
         equal poses: those that are there come first. Without it two equal poses are enough to
         know that the image does not decide, and no more are laid on it.
-    :ivar before: what was refused at other looks at the same image.
+    :ivar before: what came of other looks at the same image.
     """
 
     sight: Sight
     doubts: Set[int]
     prediction: Prediction | None
     told: Told | None
-    before: Sequence[Refused]
+    before: Mapping[Sight, Sifted]
+
+    @property
+    def refused(self) -> Iterator[tuple[Sight, Refused]]:
+        """What was refused at these."""
+        return ((sight, refused) for sight, sifted in self.before.items()
+                for refused in sifted.refused)
 
 
 class Sifter:
@@ -253,12 +259,14 @@ class Sifter:
 
         None where it was not, or where other colours may show lines that it missed.
         """
-        for refused in case.before:
+        for sight, refused in case.refused:
             alignment, against = refused.alignment, refused.objection
-            if alignment is None or against is None or alignment.missing or not same_pose(
+            if alignment is None or against is None or not same_pose(
                     start.pose, alignment.pose):
                 continue
-            if not against.hidden:
+            if alignment.missing and sight.colours is not case.sight.colours:
+                continue
+            if not against.hidden or misses_lines(alignment):
                 return alignment, against
             expected = self._expected(case, alignment)
             found = self._judge.by_strips(
