@@ -162,8 +162,8 @@ class Ledger:
         self._refused.append(Refused(against))
         self._hidden.append(Candidate(strips.pose, strips.score))
 
-    def miss(self, pose: Pose2) -> None:
-        """Note a pose that does not lie on the image."""
+    def begin(self, pose: Pose2) -> None:
+        """Note from where a pose was laid on the image: from its twins one comes to twins."""
         self._settle_twins(pose)
 
     def hold(self, found: Found, strips: FittedCandidate | None) -> list[Pose2]:

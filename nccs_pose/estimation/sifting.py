@@ -194,8 +194,9 @@ class Sifter:
                 ledger.rule_out(start.strips, against)
                 return None
         verdict = self._again(case, start, ledger) or self._verdict(case, start, ledger)
+        if verdict is None or verdict[1] is not _DOUBTFUL:
+            ledger.begin(start.pose)
         if verdict is None:
-            ledger.miss(start.pose)
             return None
         alignment, found = verdict
         if isinstance(found, Found):
