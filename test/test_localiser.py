@@ -25,16 +25,18 @@ from typing import Any
 
 from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.aligner import Aligner, SPACING
-from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.judge import Judge
 import nccs_pose.estimation.localiser as localiser_module
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.symmetries import map_symmetries
-from nccs_pose.estimation.verdict import objection
+from nccs_pose.estimation.verdict import Objection, objection
 from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
@@ -409,6 +411,44 @@ def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
         left += laid is None
     # A search is right to about a pixel, here a centimetre.
     assert left >= 2
+    # So it is that leads back to where what is laid was begun.
+    assert aligner.align(
+        image, drive.pose, aligner.nominal_colours, reach=5.0,
+        laid=drive.pose @ Pose2(0.2, 0.0, 0.0)) is None
+
+
+def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = Drive(replace(SCENE, line_map=RAILS), Pose2(8.0, 0.1, 0.05))
+    options = LocaliserOptions(reach=3.0)
+    table = FloorTable(SCENE.rig, options.reach)
+    aligner = Aligner(table, RAILS, options)
+    passes: list[bool] = []
+    measure = Aligner._measure
+
+    def counted(*place: Any, **options: Any) -> Any:
+        passes.append(True)
+        return measure(*place, **options)
+
+    monkeypatch.setattr(Aligner, '_measure', counted)
+    image, start = drive.picture(), drive.pose @ Pose2(0.0, 0.02, 0.01)
+    taken = []
+    for hopeless in (None, lambda alignment: False):
+        passes.clear()
+        alignment = aligner.align(
+            image, start, aligner.nominal_colours, reach=2.0, hopeless=hopeless)
+        assert alignment is not None and leaves_open(alignment.refinement)
+        taken.append(len(passes))
+    assert taken[1] < taken[0]
+    # A search that finds nothing across the rails finds no other pose.
+    assert aligner.align(
+        image, start, aligner.nominal_colours, reach=5.0,
+        laid=drive.pose @ Pose2(0.3, 0.0, 0.0)) is None
+    # Nor would any line that should be seen there.
+    judge = Judge(Searcher(table, RAILS, options), table, RAILS, options)
+    against = judge.found(image, alignment, (), frozenset(), expected=False)
+    assert isinstance(against, Objection) and not judge.may_miss(alignment, against)
+    seen = replace(alignment, support=np.array([1.0, 1.0, 0.0, np.nan]))
+    assert judge.may_miss(seen, against)
 
 
 @pytest.mark.parametrize(('width', 'speaks'), [(0.4, False), (0.8, True)])

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
-from nccs_pose.estimation.alignment import Alignment, alignment_of, close, Pass
+from nccs_pose.estimation.alignment import Alignment, alignment_of, close, leaves_open, Pass
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
@@ -110,23 +110,29 @@ class Aligner:
         :param prior: a pose with its information (3, 3): carries the directions that the lines in
             view do not fix.
         :param hopeless: whether a pose that will not move any further is refused in any case: one
-            that is comes back as it is, before it has settled.
-        :param laid: a pose that lies on the image already.
+            that is comes back as it is, before it has settled; so does one of which a direction
+            is left open.
+        :param laid: what the start was laid to by what is near its place. No search is followed
+            that leads there, or to the start again, or that leaves a direction of the pose open.
         :returns: None where too little of what the start predicts is found, where a search leads
-            to what is laid, or where the poses do not settle.
+            to nothing new, or where the poses do not settle.
         """
         pose = start
         if reach > LINEAR_PX:
             searched = self._search(image, start, colours, reach, prior)
-            if searched is None or (laid is not None and _near(searched, laid)):
+            if searched is None:
                 return None
-            pose = searched
+            pose = searched.pose
+            if laid is not None and (
+                    leaves_open(searched) or _near(pose, laid) or _near(pose, start)):
+                return None
         places = self._places(pose) if reach > 0.0 else self._places_near(pose)
         if len(places) < _LEAST_STATIONS:
             return None
         begun = self._begun(image, places, pose, prior, colours, reach)
         if begun is None:
             return None
+        tried = begun[0] is not pose
         pose, attitude, colours = begun
         for k in range(_ITERATIONS):
             measured = self._measure(
@@ -141,9 +147,13 @@ class Aligner:
             settled = steady and (
                 measured.moved < _SETTLED_BLURS * sharpest or close(
                     result.pose, pose, result.covariance, _SETTLED))
-            # The first pass learns what tapes look like, and may miss what the next one finds.
-            if hopeless is not None and k > 0 and steady and measured.moved < _NEARLY:
-                settled = settled or hopeless(result)
+            # The first pass learns what tapes look like, and may miss what the next one finds. If
+            # it misses nothing, which way lines run does not depend on how blurred they are.
+            if hopeless is not None and measured.moved < LINEAR_PX:
+                settled = settled or (
+                    (k > 0 or (tried and not result.missing)) and (steady or result.is_sharp)
+                    and leaves_open(measured.refinement)) or (
+                    k > 0 and steady and measured.moved < _NEARLY and hopeless(result))
             before, pose, attitude = pose, result.pose, result.refinement.attitude
             if settled:
                 return result
@@ -225,7 +235,7 @@ class Aligner:
     def _search(
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
         reach: float, prior: tuple[Pose2, Array] | None,
-    ) -> Pose2 | None:
+    ) -> Refinement | None:
         places = self._predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
         bands, slide = self._predictor.bands(places, start)
         shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
@@ -238,7 +248,7 @@ class Aligner:
             return None
         return self._solved(
             shift[found], np.ones(int(found.sum())), slide[found], np.flatnonzero(found),
-            bands.label[found], bands.across[found], start, prior).pose
+            bands.label[found], bands.across[found], start, prior)
 
     def _solved(
         self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp],

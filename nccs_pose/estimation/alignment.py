@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from nccs_pose.estimation.common_errors import common_misfit, root_mean_square
+from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import solution
@@ -35,6 +36,10 @@ from numpy.typing import NDArray
 _PLAIN_LENGTH = 60.0
 _PLAIN_WIDTH = 1.0
 _MISSING = 0.25
+# Lines that lie on an image with so small a mean square, px^2, show by themselves where they are.
+_SHARP = 0.25
+# A direction of the pose is open when its deviation exceeds this, metres and radians.
+OPEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +92,11 @@ class Alignment:
         seen = np.bincount(label, minlength=lines)
         return 2.0 * np.bincount(label, self.bands.half_width, lines) / np.where(
             seen > 0, seen, np.nan)
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether lines lie so well on the image that it shows by itself where they are."""
+        return self.points.variance < _SHARP
 
     @cached_property
     def residual_px(self) -> float:
@@ -157,6 +167,11 @@ def _missing(
     seen = np.bincount(bands.label, plain)
     there = np.bincount(label, plain.take(found), minlength=len(seen))
     return tuple(((seen >= _PLAIN_LENGTH) & (there < _MISSING * seen)).nonzero()[0].tolist())
+
+
+def leaves_open(refinement: Refinement) -> bool:
+    """Whether what a pose rests on leaves a direction of it open."""
+    return bool(unobserved_directions(refinement.information, refinement.pose, limit=OPEN))
 
 
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:

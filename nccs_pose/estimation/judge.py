@@ -21,12 +21,12 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.aligner import SPACING
-from nccs_pose.estimation.alignment import Alignment, close
+from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.misplaced import placement, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
-from nccs_pose.estimation.observability import unobserved_directions
+from nccs_pose.estimation.observability import COINCIDENT
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.search import Searcher
@@ -65,9 +65,7 @@ _NEARLY_ALL = 0.85
 # A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
 # deviations.
 _WEAK_GATE = 3.0
-# A direction of the pose is open when its deviation exceeds this, metres and radians.
-OPEN = 0.5
-UNFIXED = Objection('the lines that it rests on do not fix a pose')
+_UNFIXED = Objection('the lines that it rests on do not fix a pose')
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +150,20 @@ class Judge:
         :param strips: what these say of it, if that is known.
         """
         # What no lines hold in its place tells nothing of where other lines are.
-        if unobserved_directions(alignment.refinement.information, alignment.pose, limit=OPEN):
-            return UNFIXED
+        if leaves_open(alignment.refinement):
+            return _UNFIXED
         return self.objection(image, alignment, doubts, expected=expected) or self.by_strips(
             alignment, segments, expected=expected, strips=strips)
+
+    def may_miss(self, alignment: Alignment, against: Objection) -> bool:
+        """Whether lines that a refused pose misses may be near their places.
+
+        Where all that are in view are parallel, none of them would fix it.
+        """
+        if against is not _UNFIXED:
+            return bool(alignment.missing)
+        x, y, _ = self._map.directions[alignment.support >= 0.0].T
+        return bool(np.abs(x * y[0] - y * x[0]).max() > COINCIDENT)
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,

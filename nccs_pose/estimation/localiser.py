@@ -29,6 +29,7 @@ from itertools import chain
 from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
+from nccs_pose.estimation.alignment import OPEN
 from nccs_pose.estimation.decision import left_open, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,
@@ -40,7 +41,7 @@ from nccs_pose.estimation.estimate import (
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
-from nccs_pose.estimation.judge import Found, Judge, lines_shown, OPEN, settled_doubts
+from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track

@@ -25,7 +25,7 @@ from nccs_pose.estimation.aligner import Aligner, LINEAR_PX
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.hypotheses import Hypothesis
-from nccs_pose.estimation.judge import fit_of, Found, is_expected, Judge, UNFIXED
+from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import ABOUT_AS_MUCH, AS_MUCH, Ledger, Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
@@ -46,10 +46,9 @@ _SEARCH_BAND = 5.0
 # Only those count that score this fraction of the best, or are where the robot should be: one that
 # holds is the best by strips or nearly so (0.93 of its score or more, of a thousand that held).
 _WORTH_TRYING = 0.75
-# An image on which lines lie as well as this shows by itself which of two poses is right.
-_SHARP = 0.8
-# On others how well lines lie tells only those apart that explain more than this of what should be
-# seen and of what is, by three lines or more, and no more where one that lies on it was refused.
+# On an image too coarse to show by itself which of two poses is right, how well lines lie tells only
+# those apart that explain more than this of what should be seen and of what is, by three lines or
+# more, and no more where one that lies on it was refused.
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
@@ -173,7 +172,7 @@ class Sifter:
                            for twin in ledger.hold(tried, start.strips))
                 undecided = self._is_undecided(case, ledger)
                 continue
-            if tried is not None and not _is_sharp(tried):
+            if tried is not None and not tried.is_sharp:
                 starts.extendleft(self._taken_for(case, tried))
             if start.strips is not None and ledger.best is None:
                 in_vain += 1
@@ -244,12 +243,11 @@ class Sifter:
             if ledger.was_laid(alignment.pose):
                 return verdict
             expected = self._expected(case, alignment)
-            found = self._judge.found(
+            found = self._unless_doubtful(case, ledger, self._judge.found(
                 sight.image, alignment, sight.segments, case.doubts, expected=expected,
-                strips=start.kept(alignment.pose))
-            verdict = alignment, self._unless_doubtful(case, ledger, found, expected)
-            if isinstance(verdict[1], Found) or not (
-                    alignment.missing or verdict[1] is UNFIXED):
+                strips=start.kept(alignment.pose)), expected)
+            verdict = alignment, found
+            if isinstance(found, Found) or not self._judge.may_miss(alignment, found):
                 break
         return verdict
 
@@ -299,7 +297,7 @@ class Sifter:
         if isinstance(found, Objection) or expected:
             return found
         alignment, candidates = found.alignment, case.sight.candidates
-        sharp, few = _is_sharp(alignment), lines_used(alignment) < 3
+        sharp, few = alignment.is_sharp, lines_used(alignment) < 3
         if sharp and not few:
             return found
         plain = not few and not ledger.has_refused and (
@@ -349,8 +347,3 @@ class Sifter:
             if measured.shown >= least and measured.score >= least_score:
                 return True
         return False
-
-
-def _is_sharp(alignment: Alignment) -> bool:
-    """Whether lines lie so well on the image that it shows by itself where they are."""
-    return fit_of(alignment.points.variance) > _SHARP
