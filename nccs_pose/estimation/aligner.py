@@ -84,6 +84,8 @@ class Aligner:
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
         self._predictor = BandPredictor(table, line_map)
+        # Lines are counted before they are measured.
+        self._places = lru_cache(1)(self._places_for)
         self._chosen = lru_cache(_REMEMBERED)(self._choose)
         self._lines = len(line_map)
         self._options = options
@@ -165,7 +167,11 @@ class Aligner:
         # Stations that come and go near their thresholds can keep it stepping to and fro.
         return replace(result, covariance=result.covariance + np.outer(step, step))
 
-    def _places(self, pose: Pose2) -> Places:
+    def lines_in_view(self, pose: Pose2) -> int:
+        """How many lines a pose says that an image shows."""
+        return len(np.unique(self._places(pose).number))
+
+    def _places_for(self, pose: Pose2) -> Places:
         """Stations for a pose, chosen for it."""
         return self._predictor.places(pose, SPACING, self._options.stations)
 

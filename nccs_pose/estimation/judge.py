@@ -16,11 +16,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Set
+from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass
 import math
 
-from nccs_pose.estimation.aligner import SPACING
 from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
@@ -39,6 +38,7 @@ from nccs_pose.estimation.verdict import (
 )
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Pose2
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -188,12 +188,16 @@ class Judge:
                 f'than {_BROAD} px', hidden=True)
         return found
 
-    def beforehand(self, strips: FittedCandidate) -> Objection | None:
-        """What strips alone say against a pose that nothing expects; None if nothing."""
+    def beforehand(
+        self, strips: FittedCandidate, lines_in_view: Callable[[Pose2], int],
+    ) -> Objection | None:
+        """What strips alone say against a pose that nothing expects; None if nothing.
+
+        :param lines_in_view: how many lines should be seen from a pose.
+        """
         if strips.claimed >= _MOST:
             return None
-        places = self._predictor.places(strips.pose, SPACING, self._options.stations)
-        seen = len(np.unique(places.number))
+        seen = lines_in_view(strips.pose)
         return _unexplained(seen) if seen < 3 else None
 
     def measured(

@@ -188,7 +188,7 @@ class Sifter:
         What came of one that does not hold is in the ledger.
         """
         if case.prediction is None and start.strips is not None:
-            against = self._judge.beforehand(start.strips)
+            against = self._judge.beforehand(start.strips, self._aligner.lines_in_view)
             if against is not None:
                 ledger.rule_out(start.strips, against)
                 return None
