@@ -46,9 +46,9 @@ _SEARCH_BAND = 5.0
 # Only those count that score this fraction of the best, or are where the robot should be: one that
 # holds is the best by strips or nearly so (0.93 of its score or more, of a thousand that held).
 _WORTH_TRYING = 0.75
-# On an image too coarse to show by itself which of two poses is right, how well lines lie tells only
-# those apart that explain more than this of what should be seen and of what is, by three lines or
-# more, and no more where one that lies on it was refused.
+# On an image too coarse to show by itself which of two poses is right, how well lines lie tells
+# only those apart that explain more than this of what should be seen and of what is, by three
+# lines or more, and no more where one that lies on it was refused.
 _PLAINLY_ALL = 0.9
 # Where the image moves a pose by less than this, m and rad, the strips lie on it as they did.
 _AS_LAID = (0.03, 0.01)
