@@ -30,6 +30,7 @@ from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import OPEN
+from nccs_pose.estimation.case import Case
 from nccs_pose.estimation.decision import left_open, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,
@@ -47,8 +48,9 @@ from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.rivals import Rivals
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.sifting import Case, Sifter
+from nccs_pose.estimation.sifting import Sifter
 from nccs_pose.estimation.sights import Sight, sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.symmetries import map_symmetries
@@ -107,8 +109,8 @@ class Localiser:
         self._searcher = Searcher(self._table, self._map, options)
         self._judge = Judge(self._searcher, self._table, self._map, options)
         self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
-        self._sifter = Sifter(
-            aligner, self._searcher, self._judge, self._symmetries, options)
+        rivals = Rivals(aligner, self._searcher, self._judge, self._symmetries, options)
+        self._sifter = Sifter(aligner, self._judge, rivals, self._symmetries, options)
 
     def reset(self) -> None:
         """Forget everything: poses, odometry, colours, stamps."""

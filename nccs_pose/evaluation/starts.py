@@ -25,6 +25,7 @@ from collections import Counter
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass
+import gc
 import zlib
 
 import cv2
@@ -109,6 +110,9 @@ def run_starts(
     costs = []
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
+    # As the node does: what is built lives on, and is not gone through at every collection.
+    gc.collect()
+    gc.freeze()
     try:
         for k in range(trials):
             rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), k])
@@ -122,6 +126,7 @@ def run_starts(
             costs.append((cost, threshold))
             progress(place.name)
     finally:
+        gc.unfreeze()
         cv2.setNumThreads(threads)
     return Starts(place, width, states, wrong, without, *np.array(costs).T)
 
