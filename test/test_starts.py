@@ -50,6 +50,14 @@ def test_in_the_arena_every_image_gives_the_pose() -> None:
     assert min(starts.cost.min(), starts.threshold.min()) > 0.0
 
 
+def test_among_many_lines_every_image_gives_the_pose() -> None:
+    # At the first look at the last of them strips speak against the pose, at the next no more.
+    dense = next(place for place in PLACES if place.name == 'scattered, dense')
+    starts = run_starts(dense, 1280, 14)
+    assert starts.states == {State.TRACKING: 14}
+    assert starts.wrong == 0
+
+
 @pytest.mark.parametrize(('answer', 'wrong', 'without'), [
     (Estimate(0, State.TRACKING, '', FAR, np.diag((1e-4, 1e-4, 1e-4))), 3, 0),
     (Estimate(0, State.TRACKING, '', FAR, np.diag((1e6, 1e6, 1e6))), 0, 0),
