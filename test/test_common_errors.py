@@ -88,6 +88,27 @@ def test_what_many_neighbours_share_is_rather_overrated(b: list[float], a: list[
     assert nees < 1.0
 
 
+@pytest.mark.parametrize('share', [0.0, 0.1, 0.2])
+def test_what_a_tile_shares_counts_in_a_fine_image_too(share: float) -> None:
+    # More than twice the stations: a tile spans twelve, a group six of them.
+    per_line, tile = 138, 12
+    label = np.repeat(np.arange(LINES), per_line)
+    along = np.tile(np.linspace(-1.0, 1.0, per_line), LINES)
+    pose = np.linalg.qr(np.stack([
+        1.0 * (label == 0) - (label == 2), 1.0 * (label == 1) - (label == 3), along], axis=1))[0]
+    leverage, first = np.square(pose).sum(axis=1), np.arange(0, len(label), 6)
+    rng, squares = np.random.default_rng(3), []
+    for _ in range(600):
+        own = rng.standard_normal((LINES, per_line))
+        tiles = lfilter(
+            np.ones(tile), [1.0], rng.standard_normal((LINES, per_line + tile)))[:, tile:]
+        error = np.sqrt(1.0 - share) * own.ravel() + np.sqrt(share / tile) * tiles.ravel()
+        taken = pose.T @ error
+        squares.append(np.mean(taken**2) / common_variance(
+            error - pose @ taken, leverage, label, first))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.25)
+
+
 @pytest.mark.parametrize(('near', 'far'), [(1.5, 0.5), (0.5, 1.5)])
 def test_errors_count_by_what_they_do_to_the_pose(near: float, far: float) -> None:
     # Two lines tell of the pose; the others are as many stations, but far away.

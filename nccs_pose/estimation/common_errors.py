@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.bands import in_whole_parts
+from nccs_pose.vision.bands import in_whole_parts, runs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +29,9 @@ _REDDER = 2.5
 _LIMIT = 0.7
 # A claim from sums fewer than so many would be too uncertain for any correction.
 _LEAST_FREEDOM = 5.0
+# What a floor's texture makes alike reaches as far along a tape in a fine image as in a coarse
+# one: about so many sums of neighbours, not more of shorter stretches.
+_SUMS = 40
 # So many neighbours may share one cause of misfit (a block of JPEG, a tile).
 _BLOCK = 4
 
@@ -40,7 +43,8 @@ def common_variance(
 
     Neighbours err alike where a texture or a block of JPEG spans several, and against each other
     where the pixels' grid lies on the template in turns. The sums of whole groups of neighbours
-    hold all of that, however far it reaches within them.
+    hold all of that, however far it reaches within them; of small groups, in a fine image, several
+    together.
 
     Errors weigh what they do in the fit. A near tape tells most of a pose, and compared with the
     noise told it may err more than a far one (coarse JPEG, whose far tapes are all template) or
@@ -67,6 +71,7 @@ def common_variance(
     error = np.sqrt(leverage, out=weighed[0])
     error *= residual
     weighed[1] = leverage
+    first = _of_several(first, label)
     sums, shares = np.add.reduceat(weighed, first, axis=1)
     fitted, shared = max(float(shares.sum()), 1e-12), _square(shares)
     left = max(fitted - shared, 0.0)
@@ -84,6 +89,16 @@ def common_variance(
     # Less what independent errors of so many stations show by chance.
     beyond_chance = max(alike**2 - 2.0 * taken / fitted, 0.0)
     return together * math.exp(_REDDER * beyond_chance)
+
+
+def _of_several(first: NDArray[np.intp], label: NDArray[np.intp]) -> NDArray[np.intp]:
+    """First stations of about _SUMS groups, each of as many of those given on one line."""
+    several = round(len(first) / _SUMS)
+    if several < 2:
+        return first
+    begin, count = runs(label.take(first))
+    within = np.arange(len(first)) - begin.repeat(count)
+    return first[within % several == 0]
 
 
 def common_misfit(offset: Array, label: NDArray[np.intp]) -> float:
