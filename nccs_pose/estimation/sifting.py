@@ -161,18 +161,16 @@ class Sifter:
     ) -> tuple[Alignment, Found | Objection] | None:
         """Judge a pose that was laid on the image at another look by what is new at this one.
 
-        None where it was not, where other colours may show lines that it missed, or where what
-        spoke against it may have been the strips of that look.
+        None where it was not, or where other colours may show lines that it missed.
         """
         for sight, refused in case.refused:
             alignment, against = refused.alignment, refused.objection
             if alignment is None or against is None or not same_pose(
                     start.pose, alignment.pose):
                 continue
-            if alignment.missing and (
-                    sight.colours is not case.sight.colours or not against.hidden):
+            if alignment.missing and sight.colours is not case.sight.colours:
                 continue
-            if not against.hidden or misses_lines(alignment):
+            if not (against.hidden or against.by_strips) or misses_lines(alignment):
                 return alignment, against
             expected = self._expected(case, alignment)
             found = self._judge.by_strips(

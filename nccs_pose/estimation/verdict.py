@@ -51,11 +51,14 @@ class Objection:
     :ivar line: the map line that is seen beside its place in this image, by its index; None where
         none is for certain: what lies near a line's place may be another thing.
     :ivar hidden: whether the pose may still be right, if something hides what should be seen.
+    :ivar by_strips: whether it is strips that speak against the pose: another look at the image
+        may show others.
     """
 
     words: str
     line: int | None = None
     hidden: bool = False
+    by_strips: bool = False
 
 
 def lines_used(alignment: Alignment) -> int:
@@ -173,7 +176,8 @@ def contradiction(
             offset = _beside(strip, alignment.pose, line_map[k])
             if offset is not None:
                 return Objection(
-                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map')
+                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map',
+                    by_strips=True)
     return None
 
 
