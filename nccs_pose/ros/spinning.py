@@ -94,6 +94,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         cannot be read or used.
     """
     node: Node | None = None
+    executor: GuardedExecutor | None = None
     try:
         initialise(args)
         node = make_node()
@@ -113,6 +114,10 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
             raise
     finally:
         undisturbed()
+        if executor is not None:
+            # An interrupted wait holds what it waits for: left to the end of Python, that would be
+            # destroyed after what it belongs to, which may end in a segmentation fault.
+            executor.shutdown()
         if node is not None:
             getattr(node, 'close', lambda: None)()
             node.destroy_node()
