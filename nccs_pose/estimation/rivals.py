@@ -73,10 +73,11 @@ class Rivals:
         On an image so coarse that lines lie badly on it how well they lie says little, and what a
         pose shows of strips and lines has to stand out among those that lie on it, and where the
         map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
-        pose has to show all the lines that should be in view. One that explains nearly all, which
-        leaves little to stand out by, is in doubt only where another lies as well. Two lines lie
-        well on any corner, and what shows a rival may be too little to lay it on. Where the image
-        decides nothing there is no doubt.
+        pose has to show all the lines that should be in view. Too little may show the right one to
+        lay it on the image, so a rival by strips is enough; but one that explains nearly all,
+        which leaves little to stand out by, is in doubt only where another lies as well. Two lines
+        lie well on any corner, even on a sharp image. Where the image decides nothing there is no
+        doubt.
 
         :param has_refused: whether a pose that lies on the image was refused.
         """
@@ -95,6 +96,8 @@ class Rivals:
             return _ON_A_CORNER
         if sharp:
             return None
+        if rivals and not plain:
+            return _DOUBTFUL
         least_score = self._options.ambiguity_ratio * found.score if plain else 0.0
         doubted = any(
             self._shows_as_much(case, rival, found, least_score)
