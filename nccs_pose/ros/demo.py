@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-import contextlib
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -49,11 +48,10 @@ from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_ns
 from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
 from nccs_pose.ros.resources import resolve, share_directory
-from nccs_pose.ros.start import initialise
+from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import use_large_images
 import numpy as np
-import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -150,11 +148,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except NccsPoseError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        print('\ndemo: stopped')
-        return 130
     finally:
-        rclpy.try_shutdown()
+        leave()
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -177,19 +172,23 @@ def _demo(options: argparse.Namespace) -> int:
         localiser = _start_localiser(options.params, image, topics.camera_info, topics.odom)
         executor = SingleThreadedExecutor()
         executor.add_node(user)
-        spinning = threading.Thread(target=_spin, args=(executor,), daemon=True)
+        spinning = threading.Thread(target=executor.spin, daemon=True)
         spinning.start()
         try:
             _say(f'localiser started; waiting until it listens to {image}')
-            if not _listens(localiser, player, image):
+            if _listens(localiser, player, image):
+                _play(player, bag, image, record, options.rate)
+            elif not told_to_end():
                 _say('the localiser does not listen: what it printed above says why')
                 return 1
-            _play(player, bag, image, record, options.rate)
         finally:
             _stop(localiser)
             # Before ROS itself, which would leave the callback that is due for Python to warn of.
             executor.shutdown(5.0)
             spinning.join(5.0)
+    if told_to_end():
+        print('\ndemo: stopped')
+        return 130
     return _conclude(record, truth, line_map, options.output, user.pictures)
 
 
@@ -209,7 +208,7 @@ def _start_localiser(
 
 def _listens(process: subprocess.Popen[bytes], player: Player, topic: str) -> bool:
     end = time.monotonic() + START_UP
-    while process.poll() is None and time.monotonic() < end:
+    while process.poll() is None and time.monotonic() < end and not told_to_end():
         if wait_for_subscribers(player, [topic], 0.5):
             return True
     return False
@@ -221,11 +220,6 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
         process.wait(10.0)
     except subprocess.TimeoutExpired:
         process.kill()
-
-
-def _spin(executor: SingleThreadedExecutor) -> None:
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        executor.spin()
 
 
 def _play(player: Player, bag: SerialisedBag, image: str, record: Record, rate: float) -> None:
@@ -241,7 +235,8 @@ def _play(player: Player, bag: SerialisedBag, image: str, record: Record, rate: 
 
     player.play(on_sent)
     end = time.monotonic() + GRACE
-    while time.monotonic() < end and len(record.poses) < len(record.sent):
+    while (time.monotonic() < end and len(record.poses) < len(record.sent)
+           and not told_to_end()):
         time.sleep(0.05)
     progress.show(last=True)
 

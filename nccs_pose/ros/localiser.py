@@ -20,7 +20,6 @@ the second that the imports of the node take.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import os
 import signal
 import sys
@@ -29,29 +28,18 @@ from typing import Any, NoReturn
 
 def main() -> int:
     """Run the node until it is told to stop."""
-    _on_signals(_leave)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _leave)
     from nccs_pose.ros.localiser_node import make_node
     from nccs_pose.ros.spinning import run
 
-    # ROS passes the signals on to this handler: they mean the same before and after its start.
-    _on_signals(_stop)
     return run(make_node)
-
-
-def _on_signals(handler: Callable[[int, Any], NoReturn]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, handler)
 
 
 def _leave(number: int, frame: Any) -> NoReturn:
     """Nothing is to be cleaned up yet, and some imports make an ImportError of an exception."""
     os._exit(0)
-
-
-def _stop(number: int, frame: Any) -> NoReturn:
-    """No KeyboardInterrupt: where Python meets one in an exec it ends by SIGINT, caught or not."""
-    raise SystemExit(0)
 
 
 if __name__ == '__main__':

@@ -27,11 +27,10 @@ from nccs_pose.argument_types import positive, seconds
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
-from nccs_pose.ros.start import initialise, interrupt_once, leave
+from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import use_large_images
 import rclpy
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -118,13 +117,13 @@ class Player:
         return self._publishers[topic].get_subscription_count()
 
     def play(self, on_sent: OnSent | None = None) -> None:
-        """Play to the end; returns early when ROS is shut down.
+        """Play to the end; returns early when told to end.
 
         :param on_sent: called with topic and message right before each is published.
         """
         while True:
             self._play_once(on_sent)
-            if not (self._playback.loop and rclpy.ok()):
+            if told_to_end() or not self._playback.loop:
                 break
         self._wait_until_taken()
 
@@ -134,7 +133,7 @@ class Player:
         for topic, received_ns, data in self._bag.messages(tuple(self._publishers), bag_start):
             due = wall_start + 1e-9 * (received_ns - bag_start) / self._playback.rate
             self._wait_until(due, received_ns)
-            if not rclpy.ok():
+            if told_to_end():
                 return
             if on_sent is not None:
                 on_sent(topic, data)
@@ -145,14 +144,14 @@ class Player:
         """Wait for who listens reliably: what they have not got is lost when we leave."""
         end = time.monotonic() + TAKEN_TIMEOUT
         publishers = [*self._publishers.values(), *([self._clock] if self._clock else [])]
-        while rclpy.ok() and time.monotonic() < end:
+        while not told_to_end() and time.monotonic() < end:
             if all(publisher.wait_for_all_acked(Duration()) for publisher in publishers):
                 return
             time.sleep(CLOCK_PERIOD)
 
     def _wait_until(self, due: float, received_ns: int) -> None:
         """Sleep; /clock goes on meanwhile."""
-        while rclpy.ok():
+        while not told_to_end():
             left = due - time.monotonic()
             if self._clock is not None:
                 bag_time = received_ns - round(1e9 * max(left, 0.0) * self._playback.rate)
@@ -163,9 +162,12 @@ class Player:
 
 
 def wait_for_subscribers(player: Player, topics: Sequence[str], timeout: float) -> bool:
-    """Wait until each of the topics has a subscriber; false if time runs out or ROS ends."""
+    """Wait until each of the topics has a subscriber; false if time runs out first.
+
+    Or if the program is told to end.
+    """
     end = time.monotonic() + timeout
-    while rclpy.ok() and time.monotonic() < end:
+    while not told_to_end() and time.monotonic() < end:
         if all(player.subscribers(topic) for topic in topics):
             # We know of them; they may not know of us yet, and lose what is best effort.
             time.sleep(SETTLE if topics else 0.0)
@@ -181,7 +183,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     playback = Playback(
         options.rate, options.loop, options.start_offset, options.clock,
         tuple(options.topics or ()))
-    interrupt_once()
     use_large_images()
     try:
         initialise(arguments)
@@ -192,7 +193,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 if topic not in player.sent:
                     raise FileError(f'{options.bag}: --wait-for {topic}: is not played')
             waited = wait_for_subscribers(player, options.wait_for or (), options.wait_timeout)
-            if rclpy.ok() and not waited:
+            if not (waited or told_to_end()):
                 print(f'play: nobody subscribes {", ".join(options.wait_for)}; playing anyway',
                       file=sys.stderr)
             player.play()
@@ -200,11 +201,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except NccsPoseError as error:
         print(f'play: {error}', file=sys.stderr)
         return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        if rclpy.ok():  # else: shut down while publishing
-            raise
     finally:
         leave()
     return 0

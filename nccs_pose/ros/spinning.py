@@ -27,11 +27,13 @@ import sys
 import traceback
 from typing import Any
 
-from nccs_pose.ros.start import initialise, leave, StartError, undisturbed
-import rclpy
+from nccs_pose.ros.start import initialise, leave, StartError, told_to_end
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+
+STOP_PERIOD = 0.1
+"""Seconds until an idle node notices that it was told to end."""
 
 Report = Callable[[str, BaseException], None]
 
@@ -64,15 +66,11 @@ class GuardedExecutor(SingleThreadedExecutor):
         return self._guarded(super()._take_waitable, waitable)
 
     def spin(self) -> None:
-        """Run callbacks until the context is shut down."""
-        while rclpy.ok():
+        """Run callbacks until the program is told to end."""
+        while not told_to_end():
             try:
-                self.spin_once()
-            except (KeyboardInterrupt, ExternalShutdownException):
-                raise
+                self.spin_once(timeout_sec=STOP_PERIOD)
             except Exception as error:
-                if not rclpy.ok():  # shut down in the middle of a wait
-                    return
                 self._report(_culprit(error), error)
 
 
@@ -90,8 +88,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     The node may have `report(name, exception)`, called for what its callbacks raise, and
     `close()`, called before it is destroyed.
 
-    :returns: exit code: 0 after SIGINT, SIGTERM or an orderly shutdown, 2 if the ROS arguments
-        cannot be read or used.
+    :returns: exit code: 0 after SIGINT or SIGTERM, 2 if the ROS arguments cannot be read or used.
     """
     node: Node | None = None
     executor: GuardedExecutor | None = None
@@ -101,19 +98,13 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         executor = GuardedExecutor(getattr(node, 'report', None) or _log(node))
         executor.add_node(node)
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     except StartError as error:
         print(error, file=sys.stderr)
         return 2
     except ParameterException as error:  # of use_sim_time and others that rclpy itself declares
         print(f'cannot start: {error}', file=sys.stderr)
         return 2
-    except Exception:
-        if rclpy.ok():  # else: shut down while the node was made
-            raise
     finally:
-        undisturbed()
         if executor is not None:
             # An interrupted wait holds what it waits for: left to the end of Python, that would be
             # destroyed after what it belongs to, which may end in a segmentation fault.

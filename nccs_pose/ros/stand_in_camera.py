@@ -39,7 +39,7 @@ from nccs_pose.ros.conversions import (
 )
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.resources import resolve
-from nccs_pose.ros.start import initialise, interrupt_once, leave
+from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import (
     ImageSample,
@@ -52,7 +52,6 @@ from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -117,7 +116,7 @@ class StandInCamera(Node):
         samples += [(stamp_ns, 1, k) for k, stamp_ns in enumerate(drive.stamps_ns)]
         for stamp_ns, is_image, k in sorted(samples):
             late = self._wait_until(start_ns + stamp_ns)
-            if not rclpy.ok():
+            if told_to_end():
                 return
             if not is_image:
                 self._publish_odometry(start_ns + stamp_ns, drive.odometry[k])
@@ -132,7 +131,7 @@ class StandInCamera(Node):
 
     def _wait_until(self, stamp_ns: int) -> float:
         """Serve parameters and the like until a time; returns how late it is, seconds."""
-        while rclpy.ok():
+        while not told_to_end():
             left = 1e-9 * (stamp_ns - self.get_clock().now().nanoseconds)
             if left <= 0.0:
                 return -left
@@ -161,20 +160,14 @@ class StandInCamera(Node):
 
 def main() -> int:
     """Entry point of `ros2 run nccs_pose stand_in_camera`."""
-    interrupt_once()
     use_large_images()
     try:
         initialise()
         node = StandInCamera()
         node.drive()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     except NccsPoseError as error:
         print(f'stand_in_camera: {error}', file=sys.stderr)
         return 2
-    except Exception:
-        if rclpy.ok():  # else: shut down in the middle of publishing
-            raise
     finally:
         leave()
     return 0

@@ -12,19 +12,25 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Initialising ROS, with words instead of a traceback where it cannot be; and leaving it."""
+"""Initialising ROS, with words instead of a traceback where it cannot be; and leaving it.
+
+SIGINT and SIGTERM are noted, and a program ends where it looks whether it was told to. rclpy's own
+handlers are not installed: they shut ROS down from another thread, while the main thread may be in
+the middle of making, using or destroying what is taken away.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import os
 from pathlib import Path
 import signal
 import tempfile
-from typing import NoReturn
+from typing import Any
 
 from nccs_pose.errors import NccsPoseError
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 
 LOG_VARIABLES = ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')
 """Any of these says where ROS logs to; without one it does not start."""
@@ -35,43 +41,47 @@ class StartError(NccsPoseError):
 
 
 def initialise(args: Sequence[str] | None = None) -> None:
-    """Initialise rclpy; where nothing says where to log to, log to the temporary folder.
+    """Initialise rclpy; from here on SIGINT and SIGTERM are noted, see `told_to_end`.
 
-    A service manager starts programs without HOME.
+    Where nothing says where to log to, as for a service manager's programs without HOME, it is
+    logged to the temporary folder.
 
     :param args: command line, None for the program's own.
     :raises StartError: e.g. for a parameter file that is not there.
     """
+    _set_signals(_note)
     if not any(os.environ.get(name) for name in LOG_VARIABLES):
         os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), f'ros_log_{os.getuid()}'))
     try:
-        rclpy.init(args=None if args is None else list(args))
+        rclpy.init(args=None if args is None else list(args),
+                   signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # base of every RCLError
         raise StartError(f'cannot start: {" ".join(str(error).split())}') from error
 
 
-def interrupt_once() -> None:
-    """Let the first Ctrl-C raise KeyboardInterrupt, and none after it disturb the leaving.
+def told_to_end() -> bool:
+    """Whether SIGINT or SIGTERM came since ROS was initialised.
 
-    A program in a launch file gets one from the terminal and one from launch.
+    However often: in a launch file one Ctrl-C comes from the terminal and one from launch.
     """
-    def interrupt(number: int, frame: object) -> NoReturn:
-        undisturbed()
-        raise KeyboardInterrupt
-
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, interrupt)
-
-
-def undisturbed() -> None:
-    """Let SIGINT and SIGTERM do nothing from here on: what they ask for is being done."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)
+    return bool(_noted)
 
 
 def leave() -> None:
-    """Shut rclpy down, undisturbed to the end of Python, which would bring back the defaults."""
-    undisturbed()
+    """Shut rclpy down; no signal disturbs the end of Python, which brings back the defaults."""
+    _set_signals(signal.SIG_IGN)
     rclpy.try_shutdown()
+
+
+_noted: list[int] = []
+
+
+def _note(number: int, frame: object) -> None:
+    _noted.append(number)
+
+
+def _set_signals(handler: Callable[[int, Any], None] | signal.Handlers) -> None:
+    """Handle what the program was not started to ignore, as a shell's background job is."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)

@@ -40,14 +40,13 @@ from nccs_pose.evaluation.tables import table
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.conversions import compressed_message, image_message, stamp_to_ns
 from nccs_pose.ros.resources import resolve, share_directory
-from nccs_pose.ros.start import initialise, StartError
+from nccs_pose.ros.start import initialise, StartError, told_to_end
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import make_drive, render_frame
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.scene import arena_scene, Scene
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
@@ -151,17 +150,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; '
           f'rendering {DISTINCT_FRAMES} frames', flush=True)
-    frames = _frames()
     rows = [['1280 x 960', 'sent', 'received', 'dropped busy', 'lost', 'poses', 'p50 (ms)',
              'p99 (ms)', 'decode (ms)', 'estimate (ms)', 'CPU (% of a core)', 'memory (MB)',
              'load']]
     whole = True
     try:
+        frames = _frames()
         for name in options.formats:
             result = _run(name == 'jpeg', frames, options.seconds, options.rate)
             whole = whole and result.counts[0] == result.sent
             rows.append(_row(name, result))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         return 130
     except NccsPoseError as error:
         print(f'stream_benchmark: {error}', file=sys.stderr)
@@ -192,7 +191,7 @@ def _run(compressed: bool, frames: list[np.ndarray], seconds: float, rate: float
         while not node.images.get_subscription_count() or node.values.get('publishers') != '1':
             if process.poll() is not None or time.monotonic() > end:
                 raise StartError('the localiser does not listen')
-            rclpy.spin_once(node, timeout_sec=0.1)
+            _spin_once(node, 0.1)
         return _measure(node, prepared, process.pid, seconds, rate)
     finally:
         process.terminate()
@@ -240,15 +239,21 @@ def _play(
     """Send images, each by its number in a schedule that began at `start`."""
     for k in numbers:
         while (left := start + k / rate - time.monotonic()) > 0.0:
-            rclpy.spin_once(node, timeout_sec=left)
+            _spin_once(node, left)
         node.send(next(stream), -left)
+
+
+def _spin_once(node: Listener, timeout: float) -> None:
+    rclpy.spin_once(node, timeout_sec=timeout)
+    if told_to_end():
+        raise KeyboardInterrupt
 
 
 def _settle(node: Listener, before: tuple[int, ...], count: int) -> tuple[int, ...]:
     """The node's counts once it has accounted for `count` images more, or gives no more news."""
     end = time.monotonic() + 5.0
     while time.monotonic() < end and sum(node.counts()) < sum(before) + count:
-        rclpy.spin_once(node, timeout_sec=0.1)
+        _spin_once(node, 0.1)
     return node.counts()
 
 

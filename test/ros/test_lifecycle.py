@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -131,6 +133,25 @@ def test_signals_end_the_node_while_it_starts(world, how):
         world.user.spin(pause)
         assert node.stop(how) == 0, node.output
         assert 'Traceback' not in node.output
+
+
+@pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM'])
+def test_a_signal_is_noted_and_ros_stays_up_until_it_is_left(how):
+    program = f'''
+import os, signal, time
+from nccs_pose.ros.start import initialise, leave, told_to_end
+import rclpy
+initialise([])
+assert rclpy.ok() and not told_to_end()
+for _ in range(3):
+    os.kill(os.getpid(), signal.{how})
+    time.sleep(0.2)  # for a thread of ROS that would shut it down
+assert rclpy.ok() and told_to_end()
+leave()
+assert not rclpy.ok()
+'''
+    end = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert end.returncode == 0, end.stderr
 
 
 @pytest.mark.parametrize('module', ['localiser', 'stand_in_camera', 'player'])
