@@ -21,6 +21,7 @@ import contextlib
 import itertools
 import os
 from pathlib import Path
+import socket
 from typing import Any
 
 import pytest
@@ -32,6 +33,16 @@ os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(
 _NUMBERS = itertools.count()
 
 
+def _is_free(domain: int) -> bool:
+    """Whether nobody has the port of a domain's first participant, as DDS numbers them."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as user:
+        try:
+            user.bind(('', 7410 + 250 * domain))
+        except OSError:
+            return False
+    return True
+
+
 @contextlib.contextmanager
 def a_world(folder: Path) -> Iterator[Any]:
     """A DDS domain of its own, with a user in it."""
@@ -39,7 +50,8 @@ def a_world(folder: Path) -> Iterator[Any]:
     from harness import World
 
     # Domains 1 to 99 are safe on every system; neighbours in time and other runs differ.
-    domain = 1 + (os.getpid() * 7 + next(_NUMBERS)) % 99
+    domains = (1 + (os.getpid() * 7 + next(_NUMBERS)) % 99 for _ in range(99))
+    domain = next(domain for domain in domains if _is_free(domain))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_LOG_DIR', str(folder / 'ros_log'))
         world = World(domain, folder)

@@ -206,7 +206,9 @@ class World:
         process = Process(module, list(arguments), {
             **os.environ, 'ROS_DOMAIN_ID': str(self._domain),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_LOG_DIR': str(self.folder / 'ros_log'), **environment}, log)
+            'ROS_LOG_DIR': str(self.folder / 'ros_log'),
+            'PYTHONFAULTHANDLER': '1',  # where, if it ends by a segmentation fault
+            **environment}, log)
         self._processes.append(process)
         return process
 

@@ -137,7 +137,7 @@ def test_signals_end_the_node_while_it_starts(world, how):
 
 @pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM'])
 def test_a_signal_is_noted_and_ros_stays_up_until_it_is_left(how):
-    program = f'''
+    program = f"""
 import os, signal, time
 from nccs_pose.ros.start import initialise, leave, told_to_end
 import rclpy
@@ -149,7 +149,7 @@ for _ in range(3):
 assert rclpy.ok() and told_to_end()
 leave()
 assert not rclpy.ok()
-'''
+"""
     end = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
     assert end.returncode == 0, end.stderr
 
