@@ -74,6 +74,11 @@ class Scenario:
     people: int = 0
     tilt: float = 0.0
 
+    @property
+    def options(self) -> LocaliserOptions:
+        """What the localiser is told."""
+        return LocaliserOptions(tilt_sigma=self.tilt)
+
 
 @dataclass(frozen=True, eq=False)
 class Covered:
@@ -155,20 +160,10 @@ def run_scenario(
 ) -> Covered:
     """Play a scenario's trials to one localiser that forgets everything between them."""
     scene = scenario.scene()
-    options = LocaliserOptions(tilt_sigma=scenario.tilt)
-    localiser = Localiser(scene.rig, scene.line_map, options)
-    own = (seed, zlib.crc32(scenario.name.encode()))
+    localiser = Localiser(scene.rig, scene.line_map, scenario.options)
     errors, covariances = [], []
     for k in range(trials):
-        rng = np.random.default_rng([*own, k])
-        pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (*_SPREAD, np.pi))
-        standing = _standing(scene, options, np.random.default_rng([*own, k // _SHARED, 1]))
-        localiser.reset()
-        if scenario.seen is None:
-            peopled = _peopled(_fresh_floor(standing, k), scenario.people, pose, rng)
-            estimate = localiser.process(0, render(peopled, pose, rng))
-        else:
-            pose, estimate = _second_image(localiser, standing, scenario.seen, pose, rng)
+        pose, estimate = play_trial(localiser, scenario, scene, k, seed=seed)
         progress(scenario.name)
         if estimate.pose is None or estimate.covariance is None:
             continue
@@ -178,6 +173,25 @@ def run_scenario(
         covariances.append(estimate.covariance)
     return Covered(
         scenario, trials, np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)))
+
+
+def play_trial(
+    localiser: Localiser, scenario: Scenario, scene: Scene, k: int, *, seed: int = 3,
+) -> tuple[Pose2, Estimate]:
+    """The true pose and the estimate of a scenario's k-th trial.
+
+    :param scene: the scenario's, made once; the localiser is that of its rig and map.
+    """
+    own = (seed, zlib.crc32(scenario.name.encode()))
+    rng = np.random.default_rng([*own, k])
+    pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (*_SPREAD, np.pi))
+    standing = _standing(
+        scene, scenario.options, np.random.default_rng([*own, k // _SHARED, 1]))
+    localiser.reset()
+    if scenario.seen is not None:
+        return _second_image(localiser, standing, scenario.seen, pose, rng)
+    peopled = _peopled(_fresh_floor(standing, k), scenario.people, pose, rng)
+    return pose, localiser.process(0, render(peopled, pose, rng))
 
 
 def _standing(scene: Scene, options: LocaliserOptions, rng: np.random.Generator) -> Scene:
