@@ -20,7 +20,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,6 +28,7 @@ from typing import Any
 from nccs_pose.errors import FileError, GeometryError
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry, StampedTruth
+from nccs_pose.files.bag_opening import in_words, open_bag
 from nccs_pose.files.bag_topics import (
     BagTopics,
     find_topics,
@@ -36,7 +37,6 @@ from nccs_pose.files.bag_topics import (
     TYPES,
 )
 from nccs_pose.files.bag_writer import BagWriter
-from nccs_pose.files.rosbags_import import AnyReader, jazzy_typestore
 from nccs_pose.files.trajectories import quaternion_yaw
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.pose import Pose2
@@ -64,15 +64,7 @@ class BagReader:
         self.left_out: list[str] = []
 
     def __enter__(self) -> BagReader:
-        if not self.path.exists():
-            raise FileError(f'{self.path}: no such bag.')
-        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
-            raise FileError(
-                f'{self.path}: is no bag, or its recording was cut off: it has no metadata.yaml '
-                '(`ros2 bag reindex` makes one).')
-        with self._words():
-            reader = AnyReader([self.path], default_typestore=jazzy_typestore())
-            self._reader = self._stack.enter_context(reader)
+        self._reader = open_bag(self.path, self._stack)
         try:
             self.topics = find_topics(self._wanted, self.topic_types(), str(self.path))
         except FileError:
@@ -185,12 +177,12 @@ class BagReader:
         connections = [c for c in self._reader.connections if c.topic in topics]
         iterator = self._reader.messages(connections=connections)
         while True:
-            with self._words():
+            with in_words(self.path):
                 item = next(iterator, None)
                 if item is None:
                     return
                 connection, received, data = item
-            with self._words(f'message on {connection.topic} at {received} ns'):
+            with in_words(self.path, f'message on {connection.topic} at {received} ns'):
                 message = self._reader.deserialize(data, connection.msgtype)
             yield connection.topic, connection.msgtype, received, message
 
@@ -204,23 +196,6 @@ class BagReader:
             return Pose2(p.x, p.y, quaternion_yaw(q.x, q.y, q.z, q.w))
         except GeometryError as error:
             raise FileError(f'{self.path}: {topic} at {_stamp(message)} ns: {error}.') from error
-
-    @contextmanager
-    def _words(self, what: str = '') -> Iterator[None]:
-        """Say in one sentence what rosbags trips over.
-
-        On a damaged file it raises whatever its parser met: its own errors, but also struct.error,
-        AssertionError, TypeError, UnicodeDecodeError, MemoryError; none may reach the user.
-        """
-        try:
-            yield
-        except (FileError, GeneratorExit):
-            raise
-        except Exception as error:
-            reason = ' '.join(str(error).split()) or type(error).__name__
-            raise FileError(
-                f'{self.path}: {what or "the bag"} cannot be read, it may be cut short or '
-                f'damaged: {reason.rstrip(".")}.') from error
 
 
 def _stamp(message: Any) -> int:

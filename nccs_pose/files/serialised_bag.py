@@ -17,14 +17,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from nccs_pose.errors import FileError
-from nccs_pose.files.rosbags_import import AnyReader, jazzy_typestore, QosDurability
+from nccs_pose.files.bag_opening import in_words, open_bag
+from nccs_pose.files.rosbags_import import QosDurability
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,7 @@ class SerialisedBag:
         self.start_ns = self.end_ns = 0
 
     def __enter__(self) -> SerialisedBag:
-        if not self.path.exists():
-            raise FileError(f'{self.path}: no such bag.')
-        with self._in_words():
-            self._reader = self._stack.enter_context(
-                AnyReader([self.path], default_typestore=jazzy_typestore()))
+        self._reader = open_bag(self.path, self._stack)
         self.topics = tuple(
             BagTopic(c.topic, c.msgtype, _latched(c), c.msgcount)
             for c in self._reader.connections if c.msgcount)
@@ -90,23 +87,10 @@ class SerialisedBag:
         connections = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
         if not connections:
             return
-        with self._in_words():
+        with in_words(self.path):
             for connection, received_ns, data in self._reader.messages(
                     connections=connections, start=start_ns):
                 yield connection.topic, received_ns, bytes(data)
-
-    @contextmanager
-    def _in_words(self) -> Iterator[None]:
-        """On a damaged file rosbags raises whatever its parser met."""
-        try:
-            yield
-        except (FileError, GeneratorExit):
-            raise
-        except Exception as error:
-            reason = ' '.join(str(error).split()) or type(error).__name__
-            raise FileError(
-                f'{self.path}: the bag cannot be read, it may be cut short or damaged: '
-                f'{reason.rstrip(".")}.') from error
 
 
 def _latched(connection: Any) -> bool:
