@@ -59,6 +59,8 @@ def common_variance(
     what whole lines have in common. They go with such as show: floors with texture and coarse
     JPEG have both. With correlations c_k between stations k apart, on simulated images of all
     kinds, sums over lines had about exp(2.5 (c_1 + c_2)^2) times the variance of sums over groups.
+    Where that scatters it makes the inverse too large as well: an exponent with a variance of s^2
+    by exp(s^2 / 2).
 
     :param residual: of the stations (N,), whitened, along each line in order.
     :param leverage: how far each one's error moves its own fit (N,), from 0 to 1; 0 of one that
@@ -87,8 +89,11 @@ def common_variance(
     shown = products / max(float(leverage[:-2].dot(along)), 1e-12)
     alike = min(max((shown + 2.0 * taken * together) / variance, 0.0), _LIMIT)
     # Less what independent errors of so many stations show by chance.
-    beyond_chance = max(alike**2 - 2.0 * taken / fitted, 0.0)
-    return together * math.exp(_REDDER * beyond_chance)
+    chance = 2.0 * taken / fitted
+    square = max(alike**2 - chance, 0.0)
+    # The correlations scatter by as much; at most, as if all up to the limit were equally likely.
+    scatter = min(4.0 * square * chance, _LIMIT**4 / 12.0)
+    return together * math.exp(_REDDER * square + 0.5 * _REDDER**2 * scatter)
 
 
 def _of_several(first: NDArray[np.intp], label: NDArray[np.intp]) -> NDArray[np.intp]:
