@@ -17,8 +17,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from nccs_pose.calibration.blob_labels import label_blobs
 from nccs_pose.calibration.observations import FrameObservation
@@ -40,6 +41,7 @@ Images = Callable[[], Iterable[tuple[int, Image]]]
 
 _PASSES = 4
 _FEWEST = 2  # images that a better rig may be estimated from, to follow more under it
+_SOME = 30  # images that are tried by themselves, and that a rig is tried on
 _LEAST_LINES = 2
 _LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
 # A rough rig fits a single image better if that image may have a height and a tilt of its own.
@@ -119,8 +121,8 @@ def calibrate_images(
     """Refine a rough rig from the images of a drive.
 
     Under the rough rig the localiser follows some frames, or lays poses on them that it doubts,
-    and from these a better rig is estimated, under which it follows more; a rig too rough even for
-    that is refined from the blobs of the lines' colour first.
+    and from these a better rig is estimated, under which it follows more. Where that leads
+    nowhere, it is begun with single images, and with the blobs of the lines' colour.
 
     :param images: gives (stamp in ns, BGR image) anew at each call.
     :param on_pass: told in words how far it is.
@@ -128,27 +130,43 @@ def calibrate_images(
     """
     options = options or CalibrationOptions()
     parameters = RigParameters(rig, line_map, options, free_lines)
-    measured = _measure_roughly(rig, line_map, images)
-    on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly under the rough '
-            'rig')
-    try:
-        measured = _follow(parameters, measured, images, options, on_pass)
-    except CalibrationError:
-        better = _from_blobs(parameters, images, options)
-        if better is None:
-            raise
-        measured = _measure_roughly(better, line_map, images)
-        on_pass(f'{len(measured.frames)} of {measured.seen} images followed roughly after a first '
-                'guess from the blobs of the lines')
-        if not measured.frames:
-            raise
-        measured = _follow(parameters, measured, images, options, on_pass)
-    result = calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
-    # The noise was measured with what the last rig left in the residuals; now it is clean.
-    measured = measure(result.model.rig, result.model.line_map, images())
-    if _usable(measured) == 0:
-        raise CalibrationError(_nothing(measured))
-    return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+    refused: CalibrationError | None = None
+    for begun in _beginnings(parameters, images, options, on_pass):
+        try:
+            measured = _follow(parameters, begun, images, options, on_pass)
+            result = calibrate(
+                rig, line_map, measured.frames, options, free_lines, measured.poses)
+            # The noise was measured with what the last rig left in the residuals; now it is clean.
+            measured = measure(result.model.rig, result.model.line_map, images())
+            if _usable(measured) == 0:
+                raise CalibrationError(_nothing(measured))
+            return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
+        except CalibrationError as error:
+            refused = refused or error
+    assert refused is not None  # there is always the rough rig to begin with
+    raise refused
+
+
+def _beginnings(
+    parameters: RigParameters, images: Images, options: CalibrationOptions,
+    on_pass: Callable[[str], None],
+) -> Iterator[Measured]:
+    """What can be followed under rigs to begin with, each asked for when those before fail."""
+    rough = parameters.rough
+    measured = _measure_roughly(rough.rig, rough.line_map, images)
+    found = f'of {measured.seen} images followed roughly'
+    on_pass(f'{len(measured.frames)} {found} under the rough rig')
+    yield measured
+    single = _from_single_images(parameters, measured, images, options)
+    if single is not None:
+        measured = _measure_roughly(single, rough.line_map, images)
+        on_pass(f'{len(measured.frames)} {found} after a first guess from one of them')
+        yield measured
+    blobs = _from_blobs(parameters, images, options)
+    if blobs is not None:
+        measured = _measure_roughly(blobs, rough.line_map, images)
+        on_pass(f'{len(measured.frames)} {found} after a first guess from the blobs of the lines')
+        yield measured
 
 
 def _follow(
@@ -192,6 +210,31 @@ def _nothing(measured: Measured) -> str:
     return (f'the lines could not be followed in {measured.seen} images (in {count}: {reason}); '
             'the map, the kind of mirror or the colour of the lines is wrong, or the rough rig is '
             'too far off')
+
+
+def _from_single_images(
+    parameters: RigParameters, measured: Measured, images: Images, options: CalibrationOptions,
+) -> Rig | None:
+    """The rig that one of the images asks for under which most others can be followed.
+
+    A rough rig shows image after image from the same wrong place, where three lines fit. They are
+    many and agree with each other; one from the right place agrees with the rest of the drive.
+    """
+    best, most = None, _FEWEST - 1
+    some = max(1, measured.seen // _SOME)
+    for k in np.linspace(
+            0, len(measured.frames) - 1, min(len(measured.frames), _SOME)).round().astype(int):
+        try:
+            theta = converge(
+                parameters, measured.frames[k:k + 1], measured.poses[k:k + 1], options)
+        except CalibrationError:
+            continue
+        better = parameters.model(theta, with_rim=True).rig
+        count = len(_measure_roughly(
+            better, parameters.rough.line_map, lambda: islice(images(), 0, None, some)).frames)
+        if count > most:
+            best, most = better, count
+    return best
 
 
 def _from_blobs(

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from nccs_pose.calibration.adjustment import adjust, Adjustment, ArrowSystem
 from nccs_pose.calibration.first_poses import first_poses
@@ -95,7 +95,7 @@ def calibrate(
     options = options or CalibrationOptions()
     parameters = RigParameters(rig, line_map, options, free_lines)
     usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= _LEAST_LINES]
-    _demand_frames(len(usable), len(frames), options)
+    _demand_frames(len(usable), len(frames), options.min_frames)
     thin = [frames[i].thinned(options.points_per_edge) for i in usable]
     given = None if poses is None else np.asarray(poses, dtype=float)[usable]
 
@@ -104,7 +104,7 @@ def calibrate(
     judges = np.zeros(len(thin), dtype=bool)
     judges[options.held_out - 1::options.held_out] = True
     pool = np.flatnonzero(agree & ~judges)
-    _demand_frames(len(pool), len(frames), options)
+    _demand_frames(len(pool), len(frames), options.min_frames)
     told = frame_information(parameters, [thin[i] for i in pool], all_poses[pool], theta)
     chosen = np.sort(pool[choose(told, parameters.spread, options.max_frames)])
     observations = Observations.stack([thin[i] for i in chosen], line_map)
@@ -132,7 +132,7 @@ def converge(
     :raises CalibrationError: if nothing explains them.
     """
     usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= _LEAST_LINES]
-    _demand_frames(len(usable), len(frames), replace(options, min_frames=2))
+    _demand_frames(len(usable), len(frames), 1)
     thin = [frames[i].thinned(options.points_per_edge) for i in usable]
     return _start(parameters, thin, np.asarray(poses, dtype=float)[usable]).adjustment.theta
 
@@ -200,15 +200,15 @@ def _pose_all(
     return theta, judged.poses, judged.after_whitened <= limit
 
 
-def _demand_frames(usable: int, frames: int, options: CalibrationOptions) -> None:
+def _demand_frames(usable: int, frames: int, least: int) -> None:
     if usable == 0:
         raise CalibrationError(
             f'in none of {frames} frames two lines of the map were seen: is it the right map, '
             'and are the lines of its colour?')
-    if usable < options.min_frames:
+    if usable < least:
         raise CalibrationError(
             f'only {usable} of {frames} frames show two lines or more and can be used; at least '
-            f'{options.min_frames} are needed: drive through the middle of the lines and turn on '
+            f'{least} are needed: drive through the middle of the lines and turn on '
             'the spot at several places')
 
 

@@ -129,10 +129,10 @@ def _settle(
     result, agreement, used = None, -1.0, np.empty(0, dtype=np.intp)
     for _ in range(_ROUNDS):
         used = np.flatnonzero(np.isfinite(poses[:, 0]))
-        if len(used) < 2:
+        if len(used) == 0:
             raise CalibrationError(
-                f'{len(used)} of {len(frames)} frames have a pose under the rough rig: wrong '
-                'map, wrong kind of mirror, or a rough rig too far off')
+                f'none of {len(frames)} frames has a pose under the rough rig: wrong map, wrong '
+                'kind of mirror, or a rough rig too far off')
         observations = Observations.stack([frames[i] for i in used], parameters.rough.line_map)
         result = adjust(parameters, observations, poses[used], theta=theta)
         theta, poses[used] = result.theta, result.poses
