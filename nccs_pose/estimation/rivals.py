@@ -43,11 +43,12 @@ _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 _ON_A_CORNER = Objection(
     'it rests on two lines, and the image shows as much of another pose', hidden=True)
+_TWO_COARSE = Objection('it rests on two lines, and they lie badly on the image', hidden=True)
 _INCOMPLETE = Objection(
     'its lines lie badly on the image, and others that should be in view are not there',
     hidden=True)
 # What rivals alone say against a pose.
-DOUBTS = (_DOUBTFUL, _ON_A_CORNER)
+DOUBTS = (_DOUBTFUL, _ON_A_CORNER, _TWO_COARSE)
 
 
 class Rivals:
@@ -76,8 +77,8 @@ class Rivals:
         pose has to show all the lines that should be in view. Too little may show the right one to
         lay it on the image, so a rival by strips is enough; but one that explains nearly all,
         which leaves little to stand out by, is in doubt only where another lies as well. Two lines
-        lie well on any corner, even on a sharp image. Where the image decides nothing there is no
-        doubt.
+        lie well on any corner, even on a sharp image; on a coarse one, on what is no corner too.
+        Where the image decides nothing there is no doubt.
 
         :param has_refused: whether a pose that lies on the image was refused.
         """
@@ -91,11 +92,11 @@ class Rivals:
             return _INCOMPLETE
         if case.told is None and self.are_many(found, candidates):
             return None
+        if few and not sharp:
+            return _TWO_COARSE
         rivals = self._by_strips(found, candidates)
-        if few and rivals:
-            return _ON_A_CORNER
         if sharp:
-            return None
+            return _ON_A_CORNER if rivals else None
         if rivals and not plain:
             return _DOUBTFUL
         least_score = self._options.ambiguity_ratio * found.score if plain else 0.0
