@@ -22,6 +22,7 @@ import itertools
 import math
 from pathlib import Path
 from typing import Any
+import zlib
 
 from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation.aligner import Aligner, SPACING
@@ -415,6 +416,33 @@ def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
     assert aligner.align(
         image, drive.pose, aligner.nominal_colours, reach=5.0,
         laid=drive.pose @ Pose2(0.2, 0.0, 0.0)) is None
+
+
+def test_a_pose_that_steps_to_and_fro_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = arena_scene(640)
+    scene = replace(scene, appearance=replace(scene.appearance, room=None, obstacles=()))
+    rng = np.random.default_rng([7, zlib.crc32(b'arena'), 6])
+    ends = np.concatenate((scene.line_map.starts, scene.line_map.ends))[:, :2]
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    x, y = 0.5 * (low + high) + rng.uniform(-0.25, 0.25, 2) * (high - low)
+    pose = Pose2(float(x), float(y), rng.uniform(-np.pi, np.pi))
+    image = render(scene, pose, rng)
+    aligner = Aligner(FloorTable(scene.rig, DEFAULTS.reach), scene.line_map, DEFAULTS)
+    right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
+    assert right is not None
+    passes: list[Pose2] = []
+    bands = BandPredictor.bands
+
+    def counted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
+        passes.append(at)
+        return bands(predictor, places, at, *rest)
+
+    monkeypatch.setattr(BandPredictor, 'bands', counted)
+    # Half a turn round three tapes are near others' places: a quarter of the stations is found
+    # at one pose, and lost at the next.
+    assert aligner.align(
+        image, Pose2(-0.8474, -0.4820, -1.8522), right.colours, reach=2.0) is None
+    assert 3 <= len(passes) <= 5
 
 
 def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatch) -> None:

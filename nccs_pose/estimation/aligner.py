@@ -136,6 +136,7 @@ class Aligner:
             return None
         tried = begun[0] is not pose
         pose, attitude, colours = begun
+        before = pose
         for k in range(_ITERATIONS):
             measured = self._measure(
                 image, places, pose, prior, colours, attitude, rough=False)
@@ -156,15 +157,19 @@ class Aligner:
                     (k > 0 or (tried and not result.missing)) and (steady or result.is_sharp)
                     and leaves_open(measured.refinement)) or (
                     k > 0 and steady and measured.moved < _NEARLY and hopeless(result))
+            # Stations that come and go near their thresholds can keep it stepping to and fro: it
+            # ends as the last pass would.
+            returns = steady and close(result.pose, before, result.covariance, _SETTLED)
             before, pose, attitude = pose, result.pose, result.refinement.attitude
             if settled:
                 return result
+            if returns and (_ITERATIONS - k) % 2 == 1:
+                break
             if measured.moved > _MOVED_PX:
                 places = self._places(pose)
         step = pose.minus(before)
         if np.abs(step).max() > _LAST_STEP:
             return None
-        # Stations that come and go near their thresholds can keep it stepping to and fro.
         return replace(result, covariance=result.covariance + np.outer(step, step))
 
     def lines_in_view(self, pose: Pose2) -> int:
