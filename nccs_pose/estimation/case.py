@@ -64,9 +64,12 @@ class Start:
 
     def kept(self, pose: Pose2) -> FittedCandidate | None:
         """What the strips say of the pose that it became on the image; None where that is new."""
+        return self.strips if self.is_at(pose) else None
+
+    def is_at(self, pose: Pose2) -> bool:
+        """Whether the strips lie on a pose as they do on this."""
         moved = np.abs(pose.minus(self.pose))
-        near = max(moved[0], moved[1]) < _AS_LAID[0] and moved[2] < _AS_LAID[1]
-        return self.strips if near else None
+        return bool(max(moved[0], moved[1]) < _AS_LAID[0] and moved[2] < _AS_LAID[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ On a sharp image the lines of the right one alone lie well; a coarse one leaves 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
 
 from nccs_pose.estimation.aligner import Aligner
@@ -102,7 +102,7 @@ class Rivals:
         least_score = self._options.ambiguity_ratio * found.score if plain else 0.0
         doubted = any(
             self._shows_as_much(case, rival, found, least_score)
-            for rival in chain(rivals, self.taken_for(case, alignment)))
+            for rival in _distinct(chain(rivals, self.taken_for(case, alignment))))
         return _DOUBTFUL if doubted else None
 
     def taken_for(self, case: Case, alignment: Alignment) -> Iterator[Start]:
@@ -150,3 +150,12 @@ class Rivals:
             if measured.shown >= least and measured.score >= least_score:
                 return True
         return False
+
+
+def _distinct(starts: Iterable[Start]) -> Iterator[Start]:
+    """Without those on which strips lie as on one before."""
+    before: list[Start] = []
+    for start in starts:
+        if not any(other.is_at(start.pose) for other in before):
+            before.append(start)
+            yield start
