@@ -106,8 +106,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
         return 2
     finally:
         if executor is not None:
-            # An interrupted wait holds what it waits for: left to the end of Python, that would be
-            # destroyed after what it belongs to, which may end in a segmentation fault.
+            # What it waits with, left to the end of Python, would be destroyed after ROS itself.
             executor.shutdown()
         if node is not None:
             getattr(node, 'close', lambda: None)()
