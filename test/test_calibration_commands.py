@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 from nccs_pose.calibration.from_images import calibrate_images
 from nccs_pose.cli import main
+from nccs_pose.errors import CalibrationError
 from nccs_pose.evaluation.calibration_study import disturbed
 from nccs_pose.files.bags import BagReader
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
@@ -118,6 +119,12 @@ def test_a_rough_rig_in_a_room_is_found_from_the_one_image_that_it_shows_right()
     assert found.good
     # The sequence's own calibration is 0.08 px beside its images.
     assert np.abs(found.model.rig.cop - true.cop).max() < 2e-4
+
+
+def test_without_an_image_that_is_what_is_said(files):
+    rig, line_map, _ = files
+    with pytest.raises(CalibrationError, match='there is no image to calibrate from'):
+        calibrate_images(rig, line_map, list)
 
 
 def test_check_tells_a_true_rig_from_one_a_tenth_of_a_millimetre_off(drive, files, capsys):

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+import math
 
 from nccs_pose.calibration.blob_labels import label_blobs
 from nccs_pose.calibration.observations import FrameObservation
@@ -181,8 +182,7 @@ def _follow(
     for _ in range(_PASSES):
         if _usable(measured) < _FEWEST:
             raise CalibrationError(_nothing(measured))
-        theta = converge(parameters, measured.frames, measured.poses, options)
-        better = parameters.model(theta, with_rim=True).rig
+        better = _refined(parameters, measured.frames, measured.poses, options)
         measured = measure(better, line_map, images())
         on_pass(f'{len(measured.frames)} of {measured.seen} images followed under a refined rig')
         if _usable(measured) < options.min_frames:
@@ -193,6 +193,17 @@ def _follow(
     if _usable(measured) < min(options.min_frames, measured.seen):
         raise CalibrationError(_nothing(measured))
     return measured
+
+
+def _refined(
+    parameters: RigParameters, frames: Sequence[FrameObservation], poses: Array,
+    options: CalibrationOptions,
+) -> Rig:
+    """The rig that explains frames with known poses (F, 3) at all.
+
+    :raises CalibrationError: if none does.
+    """
+    return parameters.model(converge(parameters, frames, poses, options), with_rim=True).rig
 
 
 def _measure_roughly(rig: Rig, line_map: LineMap, images: Images) -> Measured:
@@ -220,18 +231,19 @@ def _from_single_images(
     A rough rig shows image after image from the same wrong place, where three lines fit. They are
     many and agree with each other; one from the right place agrees with the rest of the drive.
     """
+    if not measured.frames:
+        return None
     best, most = None, _FEWEST - 1
-    some = max(1, measured.seen // _SOME)
+    # Read once: every rig is tried on them.
+    some = list(islice(images(), 0, None, math.ceil(measured.seen / _SOME)))
     for k in np.linspace(
             0, len(measured.frames) - 1, min(len(measured.frames), _SOME)).round().astype(int):
         try:
-            theta = converge(
+            better = _refined(
                 parameters, measured.frames[k:k + 1], measured.poses[k:k + 1], options)
         except CalibrationError:
             continue
-        better = parameters.model(theta, with_rim=True).rig
-        count = len(_measure_roughly(
-            better, parameters.rough.line_map, lambda: islice(images(), 0, None, some)).frames)
+        count = len(_measure_roughly(better, parameters.rough.line_map, lambda: some).frames)
         if count > most:
             best, most = better, count
     return best
@@ -246,7 +258,6 @@ def _from_blobs(
     if len(frames) < 3:
         return None
     try:
-        theta = converge(parameters, frames, poses, options)
+        return _refined(parameters, frames, poses, options)
     except CalibrationError:
         return None
-    return parameters.model(theta, with_rim=True).rig

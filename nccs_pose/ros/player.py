@@ -162,10 +162,7 @@ class Player:
 
 
 def wait_for_subscribers(player: Player, topics: Sequence[str], timeout: float) -> bool:
-    """Wait until each of the topics has a subscriber; false if time runs out first.
-
-    Or if the program is told to end.
-    """
+    """Wait until each topic has a subscriber; false if time runs out or we are told to end."""
     end = time.monotonic() + timeout
     while not told_to_end() and time.monotonic() < end:
         if all(player.subscribers(topic) for topic in topics):
