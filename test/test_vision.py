@@ -120,6 +120,25 @@ def test_a_tape_along_the_rows_is_biased_by_its_place_between_them_at_most_a_lit
         assert np.abs(fit.shift).max() < 0.06
 
 
+@pytest.mark.parametrize('half_width', [0.5, 0.6, 2.0, 3.5])
+def test_a_sharp_tape_along_the_rows_is_measured_at_each_place_between_them(
+        half_width: float) -> None:
+    # What a pixel shows of it is the part of its square that is covered.
+    rows, places = np.arange(HEIGHT), np.arange(0.0, 1.0, 0.05)
+    errors = []
+    for place in places:
+        middle = 0.5 * HEIGHT - 0.17 + place
+        low, high = np.maximum(rows - 0.5, middle - half_width), np.minimum(
+            rows + 0.5, middle + half_width)
+        share = np.repeat(np.maximum(high - low, 0.0)[:, None], WIDTH, axis=1)
+        image = np.rint(FLOOR + share[..., None] * (GREEN - FLOOR)).astype(np.uint8)
+        bands = _straight_bands(half_width, 0.0, -place)
+        fit, _ = fit_profiles(image, bands, replace(_colour(), blur=12.0**-0.5))
+        errors.append(float(np.median(fit.shift)))
+    # Edges of a normal distribution of that blur would be off by 0.04.
+    assert np.sqrt(np.mean(np.square(errors))) < 0.025
+
+
 @pytest.mark.parametrize('half_width', [0.4, 1.0, 4.0])
 def test_measuring_again_at_the_measured_place_converges(half_width: float) -> None:
     image, green, angle = _tape(half_width, 0.2), _colour(), 0.2

@@ -34,6 +34,8 @@ _MOST_ACROSS = 31
 # So many blurs from an edge its blur is nothing. A processor is slow with numbers so small or
 # so large that they lose digits, as farther out it would be.
 _BLURRED = 9.0
+# With less blur than this, px, an edge shows that what blurs it is a square and no bell.
+_SQUARE = 0.5
 
 
 def read_pixels(
@@ -90,8 +92,8 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 
 def profile_products(
-    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, blur: float,
-    members: int,
+    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, across: Array,
+    blur: float, members: int,
 ) -> tuple[Array, Array, Array]:
     """What stations and groups say, in the products of templates and image with each other.
 
@@ -99,8 +101,17 @@ def profile_products(
     is the profile, D = dT/d(delta) and B = dT/d(blur), both times sqrt(2 pi) blur: for shifts and
     changes of the blur in :func:`unit`; s counts in blurs.
 
+    Phi is the normal distribution. Of the edges of a sharp image, which a pixel's square blurs
+    more than the lens, it is corrected by Edgeworth's series: a unit square has as seen along a
+    direction (a, b) a fourth cumulant of -(a^4 + b^4) / 120 px^4, and what lens and motion add
+    has hardly any. Otherwise a tape along the pixels' grid would seem to lie up to 0.06 px off,
+    to and fro as it passes from row to row.
+
     :param pixels: (P, N, 3) BGR.
     :param s: their place across the curve (P, N), px.
+    :param half_width: of the tape (N,), px.
+    :param across: unit normal of the curve (N, 2).
+    :param blur: standard deviation of the edges' blur, px.
     :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
         over each group (7, 8, G); those with D of each station (8, N); and the colour (3,) that
@@ -124,10 +135,13 @@ def profile_products(
     square *= -0.5
     # By OpenCV, quicker than numpy's.
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
+    squared = _edgeworth(edges, square, across, blur) if blur < _SQUARE else None
     edges *= square
     np.subtract(edges[1], edges[0], out=rows[3])
     rise += 1.0
     np.reciprocal(rise, out=rise)
+    if squared is not None:
+        rise += squared
     np.subtract(rise[0], rise[1], out=rows[0])
     np.subtract(square[1], square[0], out=rows[1])
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
@@ -140,6 +154,23 @@ def profile_products(
     by_shift = (rows.transpose(1, 0, 2) @ rows[1, :, :, None])[..., 0]
     return (pooled.transpose(1, 2, 0).astype(float, order='C'),
             by_shift.T.astype(float, order='C'), less)
+
+
+def _edgeworth(
+    edges: NDArray[np.float32], bell: NDArray[np.float32], across: Array, blur: float,
+) -> NDArray[np.float32]:
+    """What a pixel's square adds to the normal distribution Phi (2, N, P).
+
+    :param edges: distances x from both edges over the blur (2, N, P).
+    :param bell: exp(-x^2 / 2) of them.
+    """
+    cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
+    added = np.square(edges)
+    added -= 3.0
+    added *= edges
+    added *= bell
+    added *= (cumulant / (-24.0 * math.sqrt(2.0 * math.pi))).astype(np.float32)[:, None]
+    return added
 
 
 def unit(blur: float) -> float:

@@ -94,7 +94,8 @@ def fit_profiles(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
     pixels, s = read_pixels(image, bands, margin, rows)
-    pooled, by_shift, less = profile_products(pixels, s, bands.half_width, blur, bands.members)
+    pooled, by_shift, less = profile_products(
+        pixels, s, bands.half_width, bands.across, blur, bands.members)
     count = len(s)
     system = _eliminated(pooled, bands.members * count)
     if not rough:
