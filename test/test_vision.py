@@ -125,7 +125,7 @@ def test_a_sharp_tape_along_the_rows_is_measured_at_each_place_between_them(
         half_width: float) -> None:
     # What a pixel shows of it is the part of its square that is covered.
     rows, places = np.arange(HEIGHT), np.arange(0.0, 1.0, 0.05)
-    errors = []
+    errors, told = [], []
     for place in places:
         middle = 0.5 * HEIGHT - 0.17 + place
         low, high = np.maximum(rows - 0.5, middle - half_width), np.minimum(
@@ -135,8 +135,12 @@ def test_a_sharp_tape_along_the_rows_is_measured_at_each_place_between_them(
         bands = _straight_bands(half_width, 0.0, -place)
         fit, _ = fit_profiles(image, bands, replace(_colour(), blur=12.0**-0.5))
         errors.append(float(np.median(fit.shift)))
+        told.append(float(np.median(fit.sigma)))
+    error = np.sqrt(np.mean(np.square(errors)))
     # Edges of a normal distribution of that blur would be off by 0.04.
-    assert np.sqrt(np.mean(np.square(errors))) < 0.025
+    assert error < 0.025
+    # No scatter of the stations shows it: all are off alike.
+    assert 0.7 < np.sqrt(np.mean(np.square(told))) / error < 1.5
 
 
 @pytest.mark.parametrize('half_width', [0.4, 1.0, 4.0])

@@ -35,7 +35,7 @@ _MOST_ACROSS = 31
 # so large that they lose digits, as farther out it would be.
 _BLURRED = 9.0
 # With less blur than this, px, an edge shows that what blurs it is a square and no bell.
-_SQUARE = 0.5
+SHARP = 0.5
 
 
 def read_pixels(
@@ -135,7 +135,7 @@ def profile_products(
     square *= -0.5
     # By OpenCV, quicker than numpy's.
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
-    squared = _edgeworth(edges, square, across, blur) if blur < _SQUARE else None
+    squared = _edgeworth(edges, square, across, blur) if blur < SHARP else None
     edges *= square
     np.subtract(edges[1], edges[0], out=rows[3])
     rise += 1.0

@@ -32,7 +32,7 @@ from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.median import upper_median
-from nccs_pose.vision.profile_products import profile_products, read_pixels, unit
+from nccs_pose.vision.profile_products import profile_products, read_pixels, SHARP, unit
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,6 +56,11 @@ _CHANCE = 2.5
 # The blur is learned from bands that lie this well on their tapes, px; where it is above one
 # pixel it is seen, but not learned, from such as lie this many blurs off.
 _SHARP_PX = 0.3
+# By this much, px rms, the template errs of an edge that runs along the pixels' grid and is
+# blurred by their squares alone; so much more blur, px^2, makes it e times less. Both are computed
+# from squares covered exactly.
+_GRID_ERROR = 0.018
+_GRID_BLUR = 0.035
 # A line whose contrast is this many standard deviations above nothing is there.
 FOUND = 6.0
 # A line this much fainter than its colour's contrast, or a station than its line, is not.
@@ -123,8 +128,20 @@ def fit_profiles(
     gain = step * math.sqrt(0.5 * (1.0 + (seen.blur / blur) ** 2))
     # Blur draws a bent edge towards the inside of the bend.
     drawn = 0.5 * colour.blur**2 * bands.bend
-    return ProfileFit(
-        gain * fit.shift - drawn, gain * fit.sigma, fit.found), colour
+    sigma = gain * fit.sigma
+    if blur < SHARP:
+        sigma = np.hypot(sigma, _grid_error(bands, blur))
+    return ProfileFit(gain * fit.shift - drawn, sigma, fit.found), colour
+
+
+def _grid_error(bands: Bands, blur: float) -> Array:
+    """What the template of a sharp edge errs by, as the pixels' grid happens to lie (N,), px rms.
+
+    Along the grid all pixels of a station show the edge from the same places; it averages out of
+    one that passes from row to row.
+    """
+    passed = bands.spacing * np.abs(bands.across).min(axis=1)
+    return _GRID_ERROR * math.exp((1.0 / 12.0 - blur**2) / _GRID_BLUR) * np.sinc(passed)
 
 
 class _System(NamedTuple):
