@@ -135,13 +135,14 @@ def profile_products(
     square *= -0.5
     # By OpenCV, quicker than numpy's.
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
-    squared = _edgeworth(edges, square, across, blur) if blur < SHARP else None
+    sharp = _edgeworth(edges, square, across, blur) if blur < SHARP else None
     edges *= square
     np.subtract(edges[1], edges[0], out=rows[3])
     rise += 1.0
     np.reciprocal(rise, out=rise)
-    if squared is not None:
-        rise += squared
+    if sharp is not None:
+        rise += sharp[0]
+        square += sharp[1]
     np.subtract(rise[0], rise[1], out=rows[0])
     np.subtract(square[1], square[0], out=rows[1])
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
@@ -158,19 +159,24 @@ def profile_products(
 
 def _edgeworth(
     edges: NDArray[np.float32], bell: NDArray[np.float32], across: Array, blur: float,
-) -> NDArray[np.float32]:
-    """What a pixel's square adds to the normal distribution Phi (2, N, P).
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What a pixel's square adds to the normal distribution Phi, and to its bell (2, N, P).
+
+    By Hermite's polynomials: -k He3(x) of the bell to the one, k He4(x) to the other, with the
+    fourth cumulant over 24 for k.
 
     :param edges: distances x from both edges over the blur (2, N, P).
     :param bell: exp(-x^2 / 2) of them.
     """
     cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
-    added = np.square(edges)
-    added -= 3.0
-    added *= edges
-    added *= bell
-    added *= (cumulant / (-24.0 * math.sqrt(2.0 * math.pi))).astype(np.float32)[:, None]
-    return added
+    three, square = np.float32(3.0), np.square(edges)
+    third = (square - three) * edges
+    fourth = third * edges - three * square + three
+    fourth *= bell
+    fourth *= (cumulant / 24.0).astype(np.float32)[:, None]
+    third *= bell
+    third *= (cumulant / (-24.0 * math.sqrt(2.0 * math.pi))).astype(np.float32)[:, None]
+    return third, fourth
 
 
 def unit(blur: float) -> float:
