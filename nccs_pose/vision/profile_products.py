@@ -137,6 +137,8 @@ def profile_products(
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
     sharp = _edgeworth(edges, square, across, blur) if blur < SHARP else None
     edges *= square
+    if sharp is not None:
+        edges += sharp[2]
     np.subtract(edges[1], edges[0], out=rows[3])
     rise += 1.0
     np.reciprocal(rise, out=rise)
@@ -159,24 +161,23 @@ def profile_products(
 
 def _edgeworth(
     edges: NDArray[np.float32], bell: NDArray[np.float32], across: Array, blur: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What a pixel's square adds to the normal distribution Phi, and to its bell (2, N, P).
+) -> tuple[NDArray[np.float32], ...]:
+    """What a pixel's square adds to Phi(x), to its bell and to x times that, each (2, N, P).
 
-    By Hermite's polynomials: -k He3(x) of the bell to the one, k He4(x) to the other, with the
-    fourth cumulant over 24 for k.
+    By Hermite's polynomials He: -k He3(x), k He4(x) and k He5(x) of the bell, with the fourth
+    cumulant over 24 for k.
 
     :param edges: distances x from both edges over the blur (2, N, P).
     :param bell: exp(-x^2 / 2) of them.
     """
     cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
-    three, square = np.float32(3.0), np.square(edges)
+    share = (cumulant / 24.0).astype(np.float32)[:, None] * bell
+    three, four, square = np.float32(3.0), np.float32(4.0), np.square(edges)
     third = (square - three) * edges
     fourth = third * edges - three * square + three
-    fourth *= bell
-    fourth *= (cumulant / 24.0).astype(np.float32)[:, None]
-    third *= bell
-    third *= (cumulant / (-24.0 * math.sqrt(2.0 * math.pi))).astype(np.float32)[:, None]
-    return third, fourth
+    fifth = fourth * edges - four * third
+    third *= np.float32(-1.0 / math.sqrt(2.0 * math.pi))
+    return third * share, fourth * share, fifth * share
 
 
 def unit(blur: float) -> float:
