@@ -137,16 +137,14 @@ def profile_products(
     cv2.exp(powers.reshape(1, -1), powers.reshape(1, -1))
     sharp = _edgeworth(edges, square, across, blur) if blur < SHARP else None
     edges *= square
-    if sharp is not None:
-        edges += sharp[2]
     np.subtract(edges[1], edges[0], out=rows[3])
     rise += 1.0
     np.reciprocal(rise, out=rise)
-    if sharp is not None:
-        rise += sharp[0]
-        square += sharp[1]
     np.subtract(rise[0], rise[1], out=rows[0])
     np.subtract(square[1], square[0], out=rows[1])
+    if sharp is not None:
+        for row, more in zip((rows[0], rows[1], rows[3]), sharp):
+            row += more
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
     less = pixels[0, 0].astype(np.float32)
     np.subtract(pixels.T, less[:, None, None], out=rows[4:7])
@@ -161,23 +159,24 @@ def profile_products(
 
 def _edgeworth(
     edges: NDArray[np.float32], bell: NDArray[np.float32], across: Array, blur: float,
-) -> tuple[NDArray[np.float32], ...]:
-    """What a pixel's square adds to Phi(x), to its bell and to x times that, each (2, N, P).
+) -> NDArray[np.float32]:
+    """What a pixel's square adds to T, D and B (3, N, P).
 
-    By Hermite's polynomials He: -k He3(x), k He4(x) and k He5(x) of the bell, with the fourth
-    cumulant over 24 for k.
+    With k for the fourth cumulant over 24 and Hermite's polynomials He, Phi has -k He3(x) of its
+    bell more, the bell k He4(x) and x times the bell k He5(x).
 
     :param edges: distances x from both edges over the blur (2, N, P).
     :param bell: exp(-x^2 / 2) of them.
     """
     cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
-    share = (cumulant / 24.0).astype(np.float32)[:, None] * bell
+    share = (cumulant / -24.0).astype(np.float32)[:, None] * bell
     three, four, square = np.float32(3.0), np.float32(4.0), np.square(edges)
     third = (square - three) * edges
     fourth = third * edges - three * square + three
     fifth = fourth * edges - four * third
-    third *= np.float32(-1.0 / math.sqrt(2.0 * math.pi))
-    return third * share, fourth * share, fifth * share
+    third *= np.float32(1.0 / math.sqrt(2.0 * math.pi))
+    left, right = (share * np.array([third, fourth, fifth])).swapaxes(0, 1)
+    return np.asarray(left - right)
 
 
 def unit(blur: float) -> float:
