@@ -445,6 +445,31 @@ def test_a_pose_that_steps_to_and_fro_is_given_up_at_once(monkeypatch: pytest.Mo
     assert 3 <= len(passes) <= 5
 
 
+def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = arena_scene(1280)
+    pose = Pose2(0.3, -0.2, 0.7)
+    image = render(scene, pose, np.random.default_rng(5))
+    aligner = Aligner(FloorTable(scene.rig, DEFAULTS.reach), scene.line_map, DEFAULTS)
+    right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
+    assert right is not None
+    passes, bands = [], BandPredictor.bands
+
+    def counted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
+        passes.append(at)
+        return bands(predictor, places, at, *rest)
+
+    monkeypatch.setattr(BandPredictor, 'bands', counted)
+    # As far off as wheels tell of a step, and several standard deviations.
+    off = pose @ Pose2(0.002, 0.0, math.radians(-0.05))
+    followed = aligner.align(image, off, right.colours, reach=0.0)
+    assert followed is not None and len(passes) == 1
+    error = followed.pose.minus(right.pose)
+    start = off.minus(right.pose)
+    assert start @ np.linalg.solve(right.covariance, start) > 4.0**2
+    assert error @ np.linalg.solve(right.covariance, error) < 1.0
+
+
 def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = Drive(replace(SCENE, line_map=RAILS), Pose2(8.0, 0.1, 0.05))
     options = LocaliserOptions(reach=3.0)

@@ -63,6 +63,12 @@ _ITERATIONS = 8
 # half a standard deviation), or when it was below half a standard deviation.
 _SETTLED_BLURS = 0.1
 _SETTLED = 0.5
+# Of a robot that is followed one pass is enough if it misses no more of its step than so many
+# standard deviations: this part of it and, times the square of the blurs that it moves a station
+# by, that part.
+_FOLLOWED = 0.2
+_MISSED = 0.01
+_MISSED_BEYOND = 0.05
 # Nor does a pass count that has just learned a blur so different, px: a template too soft or too
 # sharp takes a step for larger or smaller than it is.
 _LEARNED_BLUR = 0.1
@@ -147,9 +153,10 @@ class Aligner:
             if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
                 return None
             sharpest, steady = _sharpest(colours), _is_steady(known, colours)
-            settled = steady and (
-                measured.moved < _SETTLED_BLURS * sharpest or close(
-                    result.pose, pose, result.covariance, _SETTLED))
+            blurs = measured.moved / sharpest
+            settled = steady and (blurs < _SETTLED_BLURS or close(
+                result.pose, pose, result.covariance,
+                _SETTLED if reach > 0.0 else _FOLLOWED / (_MISSED + _MISSED_BEYOND * blurs**2)))
             # The first pass learns what tapes look like, and may miss what the next one finds. If
             # it misses nothing, which way lines run does not depend on how blurred they are.
             if hopeless is not None and measured.moved < LINEAR_PX:

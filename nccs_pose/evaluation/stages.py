@@ -15,10 +15,11 @@
 
 """What a frame costs, stage by stage, against one full-frame HSV threshold of the same image.
 
-Frames of a drive through the arena are tracked, then searched as if the robot were lost; before
-and after each, the same image is thresholded (cvtColor and inRange). Times are the thread's own
-processor time with OpenCV held to one thread, so that what else the machine does meanwhile is not
-counted; every ratio is of neighbours in time, and its quartiles are part of the result.
+Frames of a drive through the arena, with wheels that err, are tracked, then searched as if the
+robot were lost; before and after each, the same image is thresholded (cvtColor and inRange). Times
+are the thread's own processor time with OpenCV held to one thread, so that what else the machine
+does meanwhile is not counted; every ratio is of neighbours in time, and its quartiles are part of
+the result.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from nccs_pose.estimation.estimate import Estimate, StageTimes
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.simulation.drive import measure_odometry, WheelModel
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene
@@ -92,10 +94,11 @@ def measure_stages(
         raise OptionError(f'frames = {frames}: quartiles need at least {LEAST_FRAMES}')
     scene, track = arena_scene(width), figure_of_eight()
     rng = np.random.default_rng(seed)
-    poses = [track.pose(k / _RATE) for k in range(frames)]
+    wheels = measure_odometry(
+        track, frames / _RATE, WheelModel(rate=_RATE), np.random.default_rng([seed, 1]), 0)
     images = []
-    for pose in poses:
-        images.append(render(scene, pose, rng))
+    for k in range(frames):
+        images.append(render(scene, track.pose(k / _RATE), rng))
         progress('rendered')
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -104,7 +107,8 @@ def measure_stages(
         localiser = Localiser(scene.rig, scene.line_map)
         localiser.process(0, images[0])
         start_up = time.perf_counter() - start
-        modes = {mode: _run(localiser, poses, images, mode, progress)
+        told = [sample.pose for sample in wheels]
+        modes = {mode: _run(localiser, told, images, mode, progress)
                  for mode in (TRACKING, SEARCHING)}
     finally:
         cv2.setNumThreads(threads)
@@ -125,18 +129,20 @@ class _Frame:
 
 
 def _run(
-    localiser: Localiser, poses: list[Pose2], images: list[NDArray[np.uint8]], mode: str,
+    localiser: Localiser, wheels: list[Pose2], images: list[NDArray[np.uint8]], mode: str,
     progress: Callable[[str], None],
 ) -> list[_Frame]:
-    """Give all images but the first, which only starts tracking, and time them."""
+    """Give all images but the first, which only starts tracking, and time them.
+
+    :param wheels: the pose by odometry at each image.
+    """
     localiser.reset()
-    # Wheels without error: the cost is what counts here.
-    localiser.add_odometry(_stamp(-1), poses[0])
-    localiser.add_odometry(_stamp(0), poses[0])
+    localiser.add_odometry(_stamp(-1), wheels[0])
+    localiser.add_odometry(_stamp(0), wheels[0])
     localiser.process(0, images[0])
     run = []
     for k in range(1, len(images)):
-        localiser.add_odometry(_stamp(k), poses[k])
+        localiser.add_odometry(_stamp(k), wheels[k])
         if mode == SEARCHING:
             localiser.relocalise()
         run.append(_frame(localiser, k, images[k]))

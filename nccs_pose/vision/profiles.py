@@ -110,22 +110,28 @@ def fit_profiles(
     half_width = bands.half_width[::bands.members]
     repeats = np.maximum(rows / bands.spacing[::bands.members], 1.0) * np.maximum(
         0.5 * count / rows / (half_width + margin), 1.0)
-    fit, shared, height, softness = _shifts(
+    seen = _shifts(
         pooled, by_shift, system, colour.discriminant, repeats, bands.label[::bands.members],
         half_width)
-    step = unit(blur)
-    seen = colour
-    if not rough:
-        misfit = step * upper_median(np.abs(shared))
+    fit, step = seen.fit, unit(blur)
+    if rough:
+        # A template softer than the edges by so much is felt from further away, and misses less.
+        gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
+    else:
+        softer, misfit = 0.0, step * upper_median(np.abs(seen.shared))
         # A template beside its tape would take the misfit for blur.
         if misfit < _SHARP_PX * max(1.0, blur):
-            seen = colour.sharpen(height, softness, system.swept[3, 3], step)
-        # What lies no better is smeared by its noise. Edges as soft move a template as told below,
-        # but one as soft as they would be noisier.
-        if misfit < _SHARP_PX:
-            colour = seen
-    # An edge moves a template softer than itself by more than the template thinks.
-    gain = step * math.sqrt(0.5 * (1.0 + (seen.blur / blur) ** 2))
+            sharpened = colour.sharpen(seen.height, seen.softness, system.swept[3, 3], step)
+            # As it does up to here: half the square of the shift over the blur.
+            softer = sharpened.blur - blur - 0.5 * step**2 / blur * seen.beside
+            # What lies no better is smeared by its noise. Edges as soft move a template as told
+            # below, but one as soft as they would be noisier.
+            if misfit < _SHARP_PX:
+                colour = sharpened
+        # An edge of blur b' moves a template of blur b by sqrt(2 b^2 / (b^2 + b'^2)) of its
+        # shift, and leaves 1 less that of the template's derivative.
+        gain = 1.0 / (1.0 - 0.5 * min(softer / blur, 1.0))
+    gain *= step
     # Blur draws a bent edge towards the inside of the bend.
     drawn = 0.5 * colour.blur**2 * bands.bend
     sigma = gain * fit.sigma
@@ -202,12 +208,14 @@ class _Seen(NamedTuple):
     :ivar shared: shift of each group as a whole (G,).
     :ivar height: contrast of each, whatever its shift (G,).
     :ivar softness: its product with B, less T (G,).
+    :ivar beside: mean square of the shifts, less that of their noise.
     """
 
     fit: ProfileFit
     shared: Array
     height: Array
     softness: Array
+    beside: float
 
 
 def _shifts(
@@ -260,9 +268,12 @@ def _shifts(
             - base * by_shift[7])
     own_power = np.maximum(by_shift[1], 1e-9)
     told_px = own_power * contrast
+    # By what tells of the blur, and the contrasts that the shifts are of.
+    total = swept[3, 3].dot(np.square(np.maximum(seen[8], 0.0)))
+    off = swept[3, 3].dot(np.square(moved) - variance / shift_power)
     return _Seen(
         ProfileFit(said / told_px, np.sqrt(noise * own_power) / told_px, found.repeat(members)),
-        moved / smooth, seen[8], seen[3])
+        moved / smooth, seen[8], seen[3], max(float(off / max(total, 1e-9)), 0.0))
 
 
 def _levels(
