@@ -418,6 +418,19 @@ def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
         laid=drive.pose @ Pose2(0.2, 0.0, 0.0)) is None
 
 
+def _passes(monkeypatch: pytest.MonkeyPatch) -> list[Pose2]:
+    """From where every pass over an image that follows is made."""
+    passes: list[Pose2] = []
+    bands = BandPredictor.bands
+
+    def noted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
+        passes.append(at)
+        return bands(predictor, places, at, *rest)
+
+    monkeypatch.setattr(BandPredictor, 'bands', noted)
+    return passes
+
+
 def test_a_pose_that_steps_to_and_fro_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = arena_scene(640)
     scene = replace(scene, appearance=replace(scene.appearance, room=None, obstacles=()))
@@ -430,14 +443,7 @@ def test_a_pose_that_steps_to_and_fro_is_given_up_at_once(monkeypatch: pytest.Mo
     aligner = Aligner(FloorTable(scene.rig, DEFAULTS.reach), scene.line_map, DEFAULTS)
     right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
     assert right is not None
-    passes: list[Pose2] = []
-    bands = BandPredictor.bands
-
-    def counted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
-        passes.append(at)
-        return bands(predictor, places, at, *rest)
-
-    monkeypatch.setattr(BandPredictor, 'bands', counted)
+    passes = _passes(monkeypatch)
     # Half a turn round three tapes are near others' places: a quarter of the stations is found
     # at one pose, and lost at the next.
     assert aligner.align(
@@ -453,13 +459,7 @@ def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
     aligner = Aligner(FloorTable(scene.rig, DEFAULTS.reach), scene.line_map, DEFAULTS)
     right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
     assert right is not None
-    passes, bands = [], BandPredictor.bands
-
-    def counted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
-        passes.append(at)
-        return bands(predictor, places, at, *rest)
-
-    monkeypatch.setattr(BandPredictor, 'bands', counted)
+    passes = _passes(monkeypatch)
     # As far off as wheels tell of a step, and several standard deviations.
     off = pose @ Pose2(0.002, 0.0, math.radians(-0.05))
     followed = aligner.align(image, off, right.colours, reach=0.0)
@@ -475,14 +475,7 @@ def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatc
     options = LocaliserOptions(reach=3.0)
     table = FloorTable(SCENE.rig, options.reach)
     aligner = Aligner(table, RAILS, options)
-    passes: list[bool] = []
-    measure = Aligner._measure
-
-    def counted(*place: Any, **options: Any) -> Any:
-        passes.append(True)
-        return measure(*place, **options)
-
-    monkeypatch.setattr(Aligner, '_measure', counted)
+    passes = _passes(monkeypatch)
     image, start = drive.picture(), drive.pose @ Pose2(0.0, 0.02, 0.01)
     taken = []
     for hopeless in (None, lambda alignment: False):

@@ -122,7 +122,7 @@ def fit_profiles(
         # A template beside its tape would take the misfit for blur.
         if misfit < _SHARP_PX * max(1.0, blur):
             sharpened = colour.sharpen(seen.height, seen.softness, system.swept[3, 3], step)
-            # As it does up to here: half the square of the shift over the blur.
+            # The blur seen holds half the square of the shift over the template's.
             softer = sharpened.blur - blur - 0.5 * step**2 / blur * seen.beside
             # What lies no better is smeared by its noise. Edges as soft move a template as told
             # below, but one as soft as they would be noisier.
