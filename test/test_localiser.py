@@ -32,6 +32,7 @@ from nccs_pose.estimation.judge import Judge
 import nccs_pose.estimation.localiser as localiser_module
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.measuring import Look, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.search import Searcher
@@ -421,13 +422,13 @@ def test_a_search_that_leads_to_what_is_laid_already_is_left() -> None:
 def _passes(monkeypatch: pytest.MonkeyPatch) -> list[Pose2]:
     """From where every pass over an image that follows is made."""
     passes: list[Pose2] = []
-    bands = BandPredictor.bands
+    measure = Measurer.measure
 
-    def noted(predictor: BandPredictor, places: Places, at: Pose2, *rest: Any) -> Any:
-        passes.append(at)
-        return bands(predictor, places, at, *rest)
+    def noted(measurer: Measurer, look: Look, *rest: Any) -> Any:
+        passes.append(look.pose)
+        return measure(measurer, look, *rest)
 
-    monkeypatch.setattr(BandPredictor, 'bands', noted)
+    monkeypatch.setattr(Measurer, 'measure', noted)
     return passes
 
 

@@ -18,9 +18,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 from nccs_pose.estimation.prediction import BandPredictor
-from nccs_pose.estimation.shift_solve import solve_shifts
+from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.shift_solve import weigh_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform
@@ -39,6 +41,10 @@ def slide() -> np.ndarray:
     """d(shift)/d(x, y, yaw, z, roll, pitch) of the stations seen from POSE (N, 6)."""
     predictor = BandPredictor(FloorTable(RIG, 5.0), MAP)
     return predictor.bands(predictor.places(POSE, 16.0, 75), POSE)[1]
+
+
+def _solved(shift: np.ndarray, *rest: Any, **options: Any) -> Refinement:
+    return weigh_shifts(shift, *rest, **options).solve(shift)
 
 
 def _each(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +157,7 @@ def test_without_outliers_it_is_weighted_least_squares(slide: np.ndarray) -> Non
     sigma = rng.uniform(0.5, 2.0, len(slide))
     shift = slide[:, :3] @ [0.004, -0.006, 0.003] + 0.01 * sigma * rng.uniform(
         -1.0, 1.0, len(slide))
-    found = solve_shifts(shift, 0.01 * sigma, slide, *_each(len(slide)), POSE)
+    found = _solved(shift, 0.01 * sigma, slide, *_each(len(slide)), POSE)
     assert found.inlier.all()
     best = least_squares(lambda v: (shift - slide[:, :3] @ v) / sigma, np.zeros(3), xtol=1e-15)
     np.testing.assert_allclose(
@@ -164,7 +170,7 @@ def test_a_third_of_outliers_changes_little(slide: np.ndarray) -> None:
     shift = slide[:, :3] @ step + 0.02 * rng.standard_normal(len(slide))
     wrong = rng.random(len(slide)) < 0.3
     shift[wrong] += rng.uniform(0.5, 3.0, int(wrong.sum()))
-    found = solve_shifts(shift, np.full(len(slide), 0.02), slide, *_each(len(slide)), POSE)
+    found = _solved(shift, np.full(len(slide), 0.02), slide, *_each(len(slide)), POSE)
     assert not found.inlier[wrong].any()
     error = found.pose.as_array() - POSE.as_array() - step
     assert error @ np.linalg.solve(found.covariance, error) < 16.3
@@ -180,8 +186,8 @@ def test_what_disturbs_a_stretch_is_seen_in_its_sum() -> None:
         # No station tells by itself that it is 2.5 sigma off; six of them do together.
         wrong = np.isin(group, rng.permutation(group[-1] + 1)[:6])
         shift = 0.02 * rng.standard_normal(len(slide)) + 0.05 * wrong
-        each = solve_shifts(shift, sigma, slide, *_each(len(slide)), POSE)
-        found = solve_shifts(shift, sigma, slide, group, np.zeros(len(slide), int), POSE)
+        each = _solved(shift, sigma, slide, *_each(len(slide)), POSE)
+        found = _solved(shift, sigma, slide, group, np.zeros(len(slide), int), POSE)
         refused.append([(~found.inlier[wrong]).mean(), (~found.inlier[~wrong]).mean()])
         squares.append([
             np.square(way.pose.as_array() - POSE.as_array()) for way in (found, each)])
@@ -201,7 +207,7 @@ def test_the_covariance_is_the_scatter(
     for _ in range(300):
         off = deviation * rng.standard_normal(3)
         shift = slide[:, 3:] @ off + 0.05 * rng.standard_normal(len(slide))
-        found = solve_shifts(
+        found = _solved(
             shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE,
             attitude_sigma=attitude)
         error = found.pose.as_array() - POSE.as_array()
@@ -217,7 +223,7 @@ def test_errors_of_which_some_are_large_let_the_pose_slide(slide: np.ndarray) ->
     for _ in range(600):
         size = np.where(rng.random(len(slide)) < 0.2, 0.15, 0.05)
         shift = size * rng.standard_normal(len(slide))
-        found = solve_shifts(
+        found = _solved(
             shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
         error = found.pose.as_array() - POSE.as_array()
         nees.append(error @ np.linalg.solve(found.covariance, error))
@@ -227,8 +233,8 @@ def test_errors_of_which_some_are_large_let_the_pose_slide(slide: np.ndarray) ->
 
 def test_the_sigma_told_is_relative(slide: np.ndarray) -> None:
     shift = 0.05 * np.random.default_rng(4).standard_normal(len(slide))
-    one = solve_shifts(shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
-    two = solve_shifts(shift, np.full(len(slide), 0.1), slide, *_each(len(slide)), POSE)
+    one = _solved(shift, np.full(len(slide), 0.05), slide, *_each(len(slide)), POSE)
+    two = _solved(shift, np.full(len(slide), 0.1), slide, *_each(len(slide)), POSE)
     np.testing.assert_allclose(one.covariance, two.covariance, rtol=0.1)
 
 
@@ -237,7 +243,7 @@ def test_a_prior_decides_what_the_stations_leave_open(slide: np.ndarray) -> None
     blind = np.zeros_like(slide)
     blind[:, 0] = 300.0
     covariance = np.diag([1.0, 0.04, 0.01])
-    found = solve_shifts(
+    found = _solved(
         np.full(len(slide), 3.0), np.full(len(slide), 0.05), blind, *_each(len(slide)), POSE,
         prior=(Pose2(0.3, 0.1, 0.5), np.linalg.inv(covariance)))
     np.testing.assert_allclose(found.pose.as_array(), [0.31, 0.1, 0.5], atol=1e-3)
@@ -251,7 +257,7 @@ def test_what_the_calibration_shifts_no_number_of_stations_averages_out(
     # Far below the noise told, all weights are one.
     shift = 0.0001 * np.random.default_rng(6).standard_normal(len(slide))
     sigma = np.full(len(slide), 0.001)
-    found = solve_shifts(
+    found = _solved(
         shift, sigma, slide, *_each(len(slide)), POSE, image_shift=across,
         calibration_sigma=0.1)
     # A shift of the image by (u, v) moves the pose by -G (u, v), G from least squares.

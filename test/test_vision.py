@@ -31,7 +31,7 @@ from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import CONTRASTS, LineColour
 from nccs_pose.vision.profile_search import search_profiles
-from nccs_pose.vision.profiles import fit_profiles
+from nccs_pose.vision.profiles import fit_profiles, ProfileFit, read_bands
 from nccs_pose.vision.segment import chromatic_mask, find_blobs, hsv_mask
 import numpy as np
 import pytest
@@ -68,6 +68,12 @@ def _colour(name: str = 'green') -> LineColour:
     return LineColour.nominal(name, BLUR)
 
 
+def _fitted(
+    image: np.ndarray, bands: Bands, colour: LineColour,
+) -> tuple[ProfileFit, LineColour]:
+    return fit_profiles(read_bands(image, bands, colour), bands, colour)
+
+
 def _straight_bands(
     half_width: float, angle: float, shift: float, spacing: float = 6.0,
 ) -> Bands:
@@ -89,7 +95,7 @@ def _straight_bands(
 def test_a_shift_put_in_is_measured(half_width: float, angle: float) -> None:
     image, green = _tape(half_width, angle), _colour()
     for shift in (0.0, 0.15, -0.3):
-        fit, _ = fit_profiles(image, _straight_bands(half_width, angle, shift), green)
+        fit, _ = _fitted(image, _straight_bands(half_width, angle, shift), green)
         assert fit.found.all()
         # Rounding to grey levels leaves some hundredths of a pixel to each station.
         assert float(np.median(fit.shift)) == pytest.approx(shift, abs=0.01 + 0.1 * abs(shift))
@@ -107,7 +113,7 @@ def test_no_template_is_computed_where_numbers_lose_their_digits(
 
     monkeypatch.setattr(cv2, 'exp', noted)
     sharp = replace(_colour(), blur=0.4)
-    fit, _ = fit_profiles(_tape(8.0, 0.1), _straight_bands(8.0, 0.1, 0.2), sharp)
+    fit, _ = _fitted(_tape(8.0, 0.1), _straight_bands(8.0, 0.1, 0.2), sharp)
     assert float(np.median(fit.shift)) == pytest.approx(0.2, abs=0.05)
     assert max(powers) < 80.0
 
@@ -115,7 +121,7 @@ def test_no_template_is_computed_where_numbers_lose_their_digits(
 def test_a_tape_along_the_rows_is_biased_by_its_place_between_them_at_most_a_little() -> None:
     # All stations then read between the pixels in the same way, and do not average out.
     for half_width in (0.3, 0.6, 1.2, 3.0, 6.0):
-        fit, _ = fit_profiles(
+        fit, _ = _fitted(
             _tape(half_width, 0.0), _straight_bands(half_width, 0.0, 0.0), _colour())
         assert np.abs(fit.shift).max() < 0.06
 
@@ -133,7 +139,7 @@ def test_a_sharp_tape_along_the_rows_is_measured_at_each_place_between_them(
         share = np.repeat(np.maximum(high - low, 0.0)[:, None], WIDTH, axis=1)
         image = np.rint(FLOOR + share[..., None] * (GREEN - FLOOR)).astype(np.uint8)
         bands = _straight_bands(half_width, 0.0, -place)
-        fit, _ = fit_profiles(image, bands, replace(_colour(), blur=12.0**-0.5))
+        fit, _ = _fitted(image, bands, replace(_colour(), blur=12.0**-0.5))
         errors.append(float(np.median(fit.shift)))
         told.append(float(np.median(fit.sigma)))
     error = np.sqrt(np.mean(np.square(errors)))
@@ -157,7 +163,7 @@ def test_of_a_sharp_image_no_part_of_a_shift_is_missed(angle: float) -> None:
     image = np.rint(FLOOR + share[..., None] / finer**2 * (GREEN - FLOOR)).astype(np.uint8)
     colour = _colour()
     for _ in range(10):
-        _, colour = fit_profiles(image, _straight_bands(half_width, angle, 0.0, 3.0), colour)
+        _, colour = _fitted(image, _straight_bands(half_width, angle, 0.0, 3.0), colour)
     assert _gain(image, half_width, angle, colour, 0.12) == pytest.approx(1.0, abs=0.012)
 
 
@@ -167,7 +173,7 @@ def _gain(
     """What is measured of a shift to either side over the shift."""
     there, back = (
         float(np.average(fit.shift, weights=fit.sigma**-2)) for fit, _ in (
-            fit_profiles(image, _straight_bands(half_width, angle, by, 3.0), colour)
+            _fitted(image, _straight_bands(half_width, angle, by, 3.0), colour)
             for by in (shift, -shift)))
     return (there - back) / (2.0 * shift)
 
@@ -186,7 +192,7 @@ def test_measuring_again_at_the_measured_place_converges(half_width: float) -> N
     for start in (-0.9, 0.8):
         left = start
         for _ in range(5):
-            fit, _ = fit_profiles(image, _straight_bands(half_width, angle, left), green)
+            fit, _ = _fitted(image, _straight_bands(half_width, angle, left), green)
             left -= float(np.median(fit.shift))
         assert abs(left) < 0.01
 
@@ -197,7 +203,7 @@ def test_sigma_is_the_scatter(half_width: float, noise: float, spacing: float) -
     shifts, sigmas = [], []
     for seed in range(6):
         image = _tape(half_width, 0.1, noise, seed)
-        fit, _ = fit_profiles(
+        fit, _ = _fitted(
             image, _straight_bands(half_width, 0.1, 0.0, spacing), _colour())
         shifts.append(fit.shift[fit.found])
         sigmas.append(fit.sigma[fit.found])
@@ -210,8 +216,8 @@ def test_sigma_is_the_scatter(half_width: float, noise: float, spacing: float) -
 @pytest.mark.parametrize('half_width', [0.6, 3.0])
 def test_close_stations_say_together_what_distant_ones_do(half_width: float) -> None:
     image, green = _tape(half_width, 0.1, 6.0), _colour()
-    coarse, _ = fit_profiles(image, _straight_bands(half_width, 0.1, 0.1, 16.0), green)
-    fine, _ = fit_profiles(image, _straight_bands(half_width, 0.1, 0.1, 2.0), green)
+    coarse, _ = _fitted(image, _straight_bands(half_width, 0.1, 0.1, 16.0), green)
+    fine, _ = _fitted(image, _straight_bands(half_width, 0.1, 0.1, 2.0), green)
     assert fine.found.all()
     assert coarse.found.all()
     weight = fine.sigma**-2.0
@@ -226,7 +232,7 @@ def test_close_stations_say_together_what_distant_ones_do(half_width: float) -> 
 def test_noise_twice_as_strong_doubles_sigma() -> None:
     medians = []
     for noise in (4.0, 8.0, 16.0):
-        fit, _ = fit_profiles(
+        fit, _ = _fitted(
             _tape(2.0, 0.1, noise), _straight_bands(2.0, 0.1, 0.0), _colour())
         medians.append(float(np.median(fit.sigma)))
     assert medians[1] / medians[0] == pytest.approx(2.0, rel=0.25)
@@ -253,7 +259,7 @@ def test_a_blurred_bend_is_measured_where_it_is(
         np.full(n, 2.0 * np.pi * radius / n), np.zeros(n, dtype=np.intp), 8)
     colour = _colour()
     for _ in range(6):
-        fit, colour = fit_profiles(image, bands, colour)
+        fit, colour = _fitted(image, bands, colour)
     assert fit.found.all()
     # Uncorrected it would be half the squared blur over the radius, inwards.
     assert abs(fit.shift.mean()) < 0.15 * 0.5 * blur**2 / radius
@@ -265,7 +271,7 @@ def test_edges_softer_than_their_template_are_not_learned_but_reckoned_with(
         half_width: float, shift: float) -> None:
     # A template that lies a third of a pixel beside its tape, or more, learns nothing.
     image, known = _tape(half_width, 0.13, blur=2.4), LineColour.nominal('green', 1.9)
-    fit, learned = fit_profiles(image, _straight_bands(half_width, 0.13, shift), known)
+    fit, learned = _fitted(image, _straight_bands(half_width, 0.13, shift), known)
     assert learned.blur == known.blur
     # By itself it takes a shift for a tenth to a sixth too little, and its noise as well.
     assert float(np.median(fit.shift)) == pytest.approx(shift, rel=0.07)
@@ -276,7 +282,7 @@ def test_edges_softer_than_their_template_are_not_learned_but_reckoned_with(
 def test_the_blur_of_the_edges_is_learned(blur: float, half_width: float) -> None:
     image, colour = _tape(half_width, 0.13, 2.0, blur=blur), _colour()
     for _ in range(8):
-        _, colour = fit_profiles(image, _straight_bands(half_width, 0.13, 0.0), colour)
+        _, colour = _fitted(image, _straight_bands(half_width, 0.13, 0.0), colour)
     # Reading between pixels blurs as well: by a quarter of a square pixel at most.
     assert blur - 0.1 < colour.blur < np.sqrt(blur**2 + 0.25) + 0.1
 
@@ -285,7 +291,7 @@ def test_nothing_is_found_where_there_is_no_tape() -> None:
     green, found = _colour(), 0
     for seed in range(8):
         empty = _tape(1.0, 0.1, 8.0, seed, tape=FLOOR)
-        fit, learned = fit_profiles(empty, _straight_bands(1.0, 0.1, 0.0), green)
+        fit, learned = _fitted(empty, _straight_bands(1.0, 0.1, 0.0), green)
         found += int(fit.found.sum())
         np.testing.assert_array_equal(learned.contrast, green.contrast)
     assert found == 0
@@ -293,7 +299,7 @@ def test_nothing_is_found_where_there_is_no_tape() -> None:
 
 def test_a_tape_of_another_colour_is_not_found() -> None:
     image = _tape(2.0, 0.1, 3.0, tape=np.array([30.0, 30.0, 150.0]))
-    fit, _ = fit_profiles(
+    fit, _ = _fitted(
         image, _straight_bands(2.0, 0.1, 0.0), _colour())
     assert not fit.found.any()
 
@@ -302,7 +308,7 @@ def test_a_covered_part_of_a_tape_is_not_found() -> None:
     image = _tape(2.0, 0.0, 2.0)
     image[:, 150:250] = FLOOR.astype(np.uint8)
     bands = _straight_bands(2.0, 0.0, 0.0)
-    fit, _ = fit_profiles(image, bands, _colour())
+    fit, _ = _fitted(image, bands, _colour())
     u = bands.centre[:, 0]
     assert not fit.found[(u > 156) & (u < 243)].any()
     assert fit.found[(u < 144) | (u > 256)].all()
@@ -363,7 +369,7 @@ def test_rendered_tapes_are_measured_where_they_are(moved: tuple[float, float, f
     image = render(scene, POSE, np.random.default_rng(0))
     table = FloorTable(scene.rig, 5.0)
     bands, _ = _predict(table, scene, Pose2.from_array(POSE.as_array() + moved))
-    fit, _ = fit_profiles(image, bands, _colour())
+    fit, _ = _fitted(image, bands, _colour())
     assert fit.found.mean() > 0.95
     error = _beside(scene, bands, fit.shift, POSE)[fit.found]
     before = _beside(scene, bands, np.zeros(len(bands)), POSE)[fit.found]
@@ -524,7 +530,7 @@ def test_every_colour_of_a_map_is_seen(
     covered, off = _recall(_mask(image, colour), 2.0, 0.1)
     assert covered > 0.98
     assert off < 0.02
-    fit, _ = fit_profiles(
+    fit, _ = _fitted(
         image, _straight_bands(2.0, 0.1, 0.2), _colour(colour))
     assert fit.found.mean() > 0.95
     assert float(np.median(fit.shift)) == pytest.approx(0.2, abs=0.03)

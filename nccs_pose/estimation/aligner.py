@@ -20,18 +20,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
-from nccs_pose.estimation.alignment import Alignment, alignment_of, close, leaves_open, Pass
+from nccs_pose.estimation.alignment import Alignment, close, leaves_open
+from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.prediction import Places
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import solve_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.profile_search import search_profiles
-from nccs_pose.vision.profiles import fit_profiles, ProfileFit, ROUGH_BLUR
+from nccs_pose.vision.profiles import ROUGH_BLUR
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,8 +49,6 @@ _SOME = (4, 2)
 _LONG = 2000.0
 _SEARCHED = 25
 _SEARCHED_SPACING = 8.0
-# A profile is linear in its shift for about so many pixels.
-LINEAR_PX = 2.0
 # What a first pass moves a start by more than this, px, that should be off by less than that, is
 # nowhere near.
 _ASTRAY_PX = 5.0
@@ -72,12 +69,13 @@ _MISSED_BEYOND = 0.05
 # Nor does a pass count that has just learned a blur so different, px: a template too soft or too
 # sharp takes a step for larger or smaller than it is.
 _LEARNED_BLUR = 0.1
+# Up to a step so large, px, what stations slide by is proportional to it.
+_SLIDING_PX = 1.0
 # After a step larger than this the stations are chosen anew, px.
 _MOVED_PX = 3.0
 # What still steps at the end, by less than this (m and rad), is uncertain by that much more.
 _LAST_STEP = 0.005
-# A pose rests on so many stations, and on so much of curve, px.
-_LEAST_STATIONS = 12
+# A pose rests on so much of curve, px.
 _LEAST_LENGTH = 192.0
 # Of a searched pose this part of what must be found at the end has to be found from the first.
 _HOPELESS = 0.8
@@ -89,15 +87,16 @@ class Aligner:
     """Lays poses on images for one rig and map."""
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
-        self._predictor = BandPredictor(table, line_map)
+        self._measurer = Measurer(table, line_map, options)
         # Lines are counted before they are measured.
         self._places = lru_cache(1)(self._places_for)
         self._chosen = lru_cache(_REMEMBERED)(self._choose)
-        self._lines = len(line_map)
         self._options = options
-        names = tuple(dict.fromkeys(line.colour for line in line_map))
-        self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
-        self.nominal_colours = tuple(LineColour.nominal(name, options.blur) for name in names)
+
+    @property
+    def nominal_colours(self) -> tuple[LineColour, ...]:
+        """The map's colours before any image."""
+        return self._measurer.nominal_colours
 
     def align(
         self,
@@ -135,7 +134,7 @@ class Aligner:
                     leaves_open(searched) or _near(pose, laid) or _near(pose, start)):
                 return None
         places = self._places(pose) if reach > 0.0 else self._places_near(pose)
-        if len(places) < _LEAST_STATIONS:
+        if len(places) < LEAST_STATIONS:
             return None
         begun = self._begun(image, places, pose, prior, colours, reach)
         if begun is None:
@@ -144,32 +143,40 @@ class Aligner:
         pose, attitude, colours = begun
         before = pose
         for k in range(_ITERATIONS):
-            measured = self._measure(
-                image, places, pose, prior, colours, attitude, rough=False)
+            look = self._measurer.look(image, places, pose, attitude, colours)
+            if look is None:
+                return None
+            measured = self._measurer.measure(look, prior, colours)
             if measured is None or measured.length < _LEAST_LENGTH:
                 return None
             known, colours = colours, measured.colours
-            result = alignment_of(measured, self._lines)
-            if reach > 0.0 and result.explained < _HOPELESS * self._options.least_explained:
+            result, last = measured.refinement, measured
+            if reach > 0.0 and (measured.alignment.explained
+                                < _HOPELESS * self._options.least_explained):
                 return None
-            sharpest, steady = _sharpest(colours), _is_steady(known, colours)
-            blurs = measured.moved / sharpest
+            steady, blurs = _is_steady(known, colours), measured.moved / _sharpest(colours)
+            part = _MISSED + _MISSED_BEYOND * blurs**2
             settled = steady and (blurs < _SETTLED_BLURS or close(
                 result.pose, pose, result.covariance,
-                _SETTLED if reach > 0.0 else _FOLLOWED / (_MISSED + _MISSED_BEYOND * blurs**2)))
+                _SETTLED if reach > 0.0 else _FOLLOWED / part))
             # The first pass learns what tapes look like, and may miss what the next one finds. If
             # it misses nothing, which way lines run does not depend on how blurred they are.
             if hopeless is not None and measured.moved < LINEAR_PX:
                 settled = settled or (
-                    (k > 0 or (tried and not result.missing)) and (steady or result.is_sharp)
-                    and leaves_open(measured.refinement)) or (
-                    k > 0 and steady and measured.moved < _NEARLY and hopeless(result))
+                    (k > 0 or (tried and not measured.alignment.missing))
+                    and (steady or measured.alignment.is_sharp) and leaves_open(result)) or (
+                    k > 0 and steady and measured.moved < _NEARLY
+                    and hopeless(measured.alignment))
             # Stations that come and go near their thresholds can keep it stepping to and fro: it
             # ends as the last pass would.
             returns = steady and close(result.pose, before, result.covariance, _SETTLED)
-            before, pose, attitude = pose, result.pose, result.refinement.attitude
+            before, pose, attitude = pose, result.pose, result.attitude
             if settled:
-                return result
+                return measured.alignment
+            # Measured again, that part of that part is missed.
+            if reach == 0.0 and steady and measured.moved < _SLIDING_PX and close(
+                    pose, before, result.covariance, _FOLLOWED / part**2):
+                return self._measurer.measure_again(look, measured).alignment
             if returns and (_ITERATIONS - k) % 2 == 1:
                 break
             if measured.moved > _MOVED_PX:
@@ -177,7 +184,8 @@ class Aligner:
         step = pose.minus(before)
         if np.abs(step).max() > _LAST_STEP:
             return None
-        return replace(result, covariance=result.covariance + np.outer(step, step))
+        return replace(
+            last.alignment, covariance=result.covariance + np.outer(step, step))
 
     def lines_in_view(self, pose: Pose2) -> int:
         """How many lines a pose says that an image shows."""
@@ -185,7 +193,7 @@ class Aligner:
 
     def _places_for(self, pose: Pose2) -> Places:
         """Stations for a pose, chosen for it."""
-        return self._predictor.places(pose, SPACING, self._options.stations)
+        return self._measurer.predictor.places(pose, SPACING, self._options.stations)
 
     def _places_near(self, pose: Pose2) -> Places:
         """The same, chosen for the nearest pose of a lattice."""
@@ -209,104 +217,51 @@ class Aligner:
         pose, attitude = start, np.zeros(3)
         inexact = _sharpest(colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
         long = reach > 0.0 and float(places.spacing.sum()) > _LONG
-        if not (inexact or long) or len(places) < _SOME[0] * _LEAST_STATIONS:
+        if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
             return pose, attitude, colours
-        for k, step in enumerate(_SOME[:1 + long]):
+        followed = reach == 0.0
+        for k, step in enumerate(_SOME if long else _SOME[:1] * (1 + followed)):
             sharpest = _sharpest(colours)
-            measured = self._measure(
-                image, places.every(step), pose, prior, colours, attitude,
+            look = self._measurer.look(
+                image, places.every(step), pose, attitude, colours,
                 rough=not long or (k == 0 and sharpest < ROUGH_BLUR))
-            if measured is None:
+            measured = None if look is None else self._measurer.measure(look, prior, colours)
+            if look is None or measured is None:
                 if inexact and reach > 0.0:
                     return None
                 break
             if 0.0 < reach <= LINEAR_PX and measured.moved > _ASTRAY_PX:
                 return None
+            near = measured.moved < LINEAR_PX
+            if followed and near:
+                measured = self._measurer.measure_again(look, measured)
             # What profiles bear needs no bands of its own.
             leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest
             pose, attitude = measured.refinement.pose, (
                 measured.refinement.attitude if leans else attitude)
             known, colours = colours, measured.colours
-            if measured.moved < LINEAR_PX and _is_steady(known, colours):
+            if near and _is_steady(known, colours):
                 break
         return pose, attitude, colours
-
-    def _fit(
-        self, image: NDArray[np.uint8], bands: Bands, colours: tuple[LineColour, ...], rough: bool,
-    ) -> tuple[ProfileFit, tuple[LineColour, ...]]:
-        """Fit the bands of each colour with that colour."""
-        if len(colours) == 1:
-            fit, learned = fit_profiles(image, bands, colours[0], rough=rough)
-            return fit, (learned,)
-        n = len(bands)
-        shift, sigma = np.zeros(n), np.ones(n)
-        found = np.zeros(n, dtype=bool)
-        learned_all = list(colours)
-        for k, colour in enumerate(colours):
-            own = self._colour_of_line[bands.label] == k
-            if own.any():
-                fit, learned_all[k] = fit_profiles(
-                    image, bands[own], colour, rough=rough)
-                shift[own], sigma[own], found[own] = fit.shift, fit.sigma, fit.found
-        return ProfileFit(shift, sigma, found), tuple(learned_all)
 
     def _search(
         self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
         reach: float, prior: tuple[Pose2, Array] | None,
     ) -> Refinement | None:
-        places = self._predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
-        bands, slide = self._predictor.bands(places, start)
+        places = self._measurer.predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
+        bands, slide = self._measurer.predictor.bands(places, start)
         shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
-        for k, colour in enumerate(colours):
-            own = self._colour_of_line[bands.label] == k
-            if own.sum() >= _LEAST_STATIONS:
-                fit = search_profiles(image, bands[own], colour, reach)
-                shift[own], found[own] = fit.shift, fit.found
-        if found.sum() < _LEAST_STATIONS:
+        for part in self._measurer.parts(bands):
+            if len(part.bands) >= LEAST_STATIONS:
+                fit = search_profiles(image, part.bands, colours[part.colour], reach)
+                shift[part.own], found[part.own] = fit.shift, fit.found
+        index, = found.nonzero()
+        if len(index) < LEAST_STATIONS:
             return None
-        return self._solved(
-            shift[found], np.ones(int(found.sum())), slide[found], np.flatnonzero(found),
-            bands.label[found], bands.across[found], start, prior)
-
-    def _solved(
-        self, shift: Array, sigma: Array, slide: Array, group: NDArray[np.intp],
-        label: NDArray[np.intp], across: Array | None, start: Pose2,
-        prior: tuple[Pose2, Array] | None,
-    ) -> Refinement:
-        options = self._options
-        return solve_shifts(
-            shift, sigma, slide, group, label, start, prior=prior,
-            attitude_sigma=(options.height_sigma, options.tilt_sigma),
-            image_shift=across, calibration_sigma=options.calibration_sigma)
-
-    def _measure(
-        self, image: NDArray[np.uint8], places: Places, start: Pose2,
-        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], attitude: Array, *,
-        rough: bool,
-    ) -> Pass | None:
-        """Measure stations where a pose predicts them, and solve; None with too few of them.
-
-        :param attitude: the base's (z, roll, pitch) off its plane as known so far (3,): what is
-            measured from there is small, and a profile is true to small shifts only.
-        """
-        bands, slide = self._predictor.bands(places, start, attitude)
-        if len(bands) < _LEAST_STATIONS:
-            return None
-        fit, colours = self._fit(image, bands, colours, rough)
-        felt = fit.found & (np.abs(fit.shift) < LINEAR_PX + 2.0 * fit.sigma)
-        used, = felt.nonzero()
-        if len(used) < _LEAST_STATIONS:
-            return None
-        by_pose, by_attitude = slide.T[:3], slide.T[3:]
-        refinement = self._solved(
-            (fit.shift + attitude.dot(by_attitude)).take(used), fit.sigma.take(used),
-            slide.T.take(used, axis=1).T, used // bands.members, bands.label.take(used),
-            bands.across.take(used, axis=0) if self._options.calibration_sigma > 0.0 else None,
-            start, prior)
-        leant = (refinement.attitude - attitude).dot(by_attitude)
-        moved = refinement.pose.minus(start).dot(by_pose) + leant
-        return Pass(
-            refinement, bands, fit, used, float(np.abs(moved).max()), leant, colours)
+        measured = shift[index]
+        return self._measurer.weigh(
+            measured, np.ones(len(index)), slide[index], index, bands, start, prior,
+        ).solve(measured)
 
 
 def _near(a: Pose2, b: Pose2) -> bool:

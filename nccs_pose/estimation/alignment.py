@@ -22,6 +22,7 @@ from functools import cached_property
 from nccs_pose.estimation.common_errors import common_misfit, root_mean_square
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.shift_solve import WeighedShifts
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import solution
 from nccs_pose.vision.bands import Bands, runs
@@ -113,10 +114,13 @@ class Alignment:
 class Pass:
     """One pass: what the stations say, which of them are used, and the pose that follows.
 
+    :ivar weighed: what the stations say, by the weights that they have.
     :ivar moved: how far the solve moves the station that it moves farthest, px.
     :ivar leant: how far height, roll and pitch alone move each (N,), px.
+    :ivar lines: so many are in the map.
     """
 
+    weighed: WeighedShifts
     refinement: Refinement
     bands: Bands
     fit: ProfileFit
@@ -124,6 +128,12 @@ class Pass:
     moved: float
     leant: Array
     colours: tuple[LineColour, ...]
+    lines: int
+
+    @cached_property
+    def alignment(self) -> Alignment:
+        """What it comes to if it is the last."""
+        return alignment_of(self)
 
     @property
     def length(self) -> float:
@@ -131,9 +141,10 @@ class Pass:
         return float(self.bands.spacing.take(self.used).sum())
 
 
-def alignment_of(measured: Pass, lines: int) -> Alignment:
-    """What a last pass over a map of so many lines comes to."""
+def alignment_of(measured: Pass) -> Alignment:
+    """What a last pass comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
+    lines = measured.lines
     inlier, = refinement.inlier.nonzero()
     index = measured.used.take(inlier)
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.

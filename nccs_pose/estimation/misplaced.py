@@ -31,7 +31,7 @@ from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.profile_search import contrast_across, overlap
-from nccs_pose.vision.profiles import fit_profiles
+from nccs_pose.vision.profiles import fit_profiles, read_bands
 import numpy as np
 from numpy.typing import NDArray
 
@@ -102,7 +102,7 @@ def placement(
     if len(bands) < _LEAST_STATIONS:
         return Placement()
     width = 2.0 * upper_median(bands.half_width)
-    fit, _ = fit_profiles(image, bands, colour)
+    fit, _ = fit_profiles(read_bands(image, bands, colour), bands, colour)
     found = int(fit.found.sum())
     mean, deviation = _mean_shift(
         (fit.shift - moved)[fit.found], fit.sigma[fit.found]) if found else (0.0, np.inf)

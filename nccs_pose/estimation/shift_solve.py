@@ -21,6 +21,7 @@ pose; who predicts again at the pose found makes it exact.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 from nccs_pose.estimation.common_errors import common_variance
@@ -52,7 +53,69 @@ _VAGUE = np.diag([1e-4, 1e-4, 1e-2])
 _ONE = np.eye(6)
 
 
-def solve_shifts(
+@dataclass(frozen=True, eq=False)
+class WeighedShifts:
+    """What N shifts say of the pose by the weights that they have been given.
+
+    :ivar start: the predicted pose, T_map_base.
+    :ivar free: which of (x, y, yaw, z, roll, pitch) are unknown (K,).
+    :ivar rows: d(shift)/d(unknowns) over the standard deviations (K, N).
+    :ivar sigma: these, px (N,).
+    :ivar root: of the weights (N,).
+    :ivar inlier: which the pose rests on (N,).
+    :ivar label: map line of each (N,).
+    :ivar first: the first of each group of neighbours (G,).
+    :ivar known: information about the unknowns beforehand (K, K).
+    :ivar told: that times what is expected of them (K,).
+    :ivar image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift
+        it by (N, 2), px; None where that is nothing.
+    """
+
+    start: Pose2
+    free: NDArray[np.intp]
+    rows: Array
+    sigma: Array
+    root: Array
+    inlier: NDArray[np.bool_]
+    label: NDArray[np.intp]
+    first: NDArray[np.intp]
+    known: Array
+    told: Array
+    image_sigma: Array | None
+
+    def solve(self, shift: Array) -> Refinement:
+        """Weigh shifts (N,) into one step of the pose, with its covariance.
+
+        :param shift: those that were weighed, px, or what they turn out to be.
+        """
+        weighed, right_side = self.rows * self.root, shift / self.sigma
+        normal = weighed.dot(weighed.T)
+        right = weighed.dot(right_side * self.root)
+        # The prior's share is weighed against residuals of the size that they have.
+        one = _ONE[:len(self.free), :len(self.free)]
+        fitted = definite_solution(normal + self.known, one)
+        e = (right_side - fitted.dot(right + self.told).dot(self.rows)) * self.root
+        leverage = (fitted.dot(weighed) * weighed).sum(axis=0)
+        # Of the biweight, psi' over the weight is 5 - 4 / root.
+        held = max(
+            5.0 - 4.0 * leverage.dot(1.0 / self.root) / max(leverage.sum(), 1e-12), _LEAST_HELD)
+        inflation = max(common_variance(e, leverage, self.label, self.first) / held**2, 1e-6)
+        covariance = definite_solution(normal / inflation + self.known, one)
+        unknowns = covariance @ (right / inflation + self.told)
+        if self.image_sigma is not None:
+            moved = self.image_sigma * (self.root / self.sigma)[:, None]
+            answer = covariance @ (weighed @ moved) / inflation
+            covariance = covariance + answer @ answer.T
+        step = np.zeros(6)
+        step[self.free] = unknowns
+        x, y, yaw = step[:3].tolist()
+        return Refinement(
+            Pose2(self.start.x + x, self.start.y + y, self.start.yaw + yaw),
+            0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], step[3:],
+            right_side - unknowns.dot(self.rows), self.inlier, True)
+
+
+def weigh_shifts(
     shift: Array,
     sigma: Array,
     slide: Array,
@@ -64,11 +127,11 @@ def solve_shifts(
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
     image_shift: Array | None = None,
     calibration_sigma: float = 0.0,
-) -> Refinement:
-    """Weigh N measured shifts into one step of the pose.
+) -> WeighedShifts:
+    """Weigh N measured shifts by how well they agree on a step of the pose.
 
     Re-weighted least squares under Cauchy's loss with its scale estimated from the residuals,
-    then a step under Tukey's biweight, from which the covariance comes; ``sigma`` is taken for
+    then weights of Tukey's biweight, from which the covariance comes; ``sigma`` is taken for
     relative there, its scale comes from the residuals and from what neighbours have in common.
     What is robustly weighted is the sum of neighbours' residuals: what disturbs a stretch of line
     disturbs all of it, and shows in the sum before it shows in any one.
@@ -99,32 +162,12 @@ def solve_shifts(
     # The sum of each group's columns as one whitened column.
     square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
     inlier = (square <= _GATE**2).repeat(members)
-    # Times the root of the weight.
     root = np.maximum(1.0 - square / _FORGOTTEN**2, _NOTHING).repeat(members)
-    weighed = rows * root
-    squares = weighed.dot(weighed.T)
-    normal, right = squares[:-1, :-1], squares[:-1, -1]
-    # The prior's share is weighed against residuals of the size that they have.
-    one = _ONE[:len(free), :len(free)]
-    fitted = definite_solution(normal + known, one)
-    e = _residual(weighed, fitted.dot(right + told))
-    leverage = (fitted.dot(weighed[:-1]) * weighed[:-1]).sum(axis=0)
-    # Of the biweight, psi' over the weight is 5 - 4 / root.
-    held = max(5.0 - 4.0 * leverage.dot(1.0 / root) / max(leverage.sum(), 1e-12), _LEAST_HELD)
-    inflation = max(common_variance(e, leverage, label, first) / held**2, 1e-6)
-    covariance = definite_solution(normal / inflation + known, one)
-    unknowns = covariance @ (right / inflation + told)
+    image_sigma = None
     if calibration_sigma > 0.0 and image_shift is not None:
-        moved = image_shift * (root / sigma)[:, None]
-        answer = covariance @ (weighed[:-1] @ moved) * (calibration_sigma / inflation)
-        covariance = covariance + answer @ answer.T
-    step = np.zeros(6)
-    step[free] = unknowns
-    x, y, yaw = step[:3].tolist()
-    return Refinement(
-        Pose2(start.x + x, start.y + y, start.yaw + yaw),
-        0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], step[3:],
-        _residual(rows, unknowns), inlier, True)
+        image_sigma = calibration_sigma * image_shift
+    return WeighedShifts(
+        start, free, rows[:-1], sigma, root, inlier, label, first, known, told, image_sigma)
 
 
 def _robust(equations: Array, known: Array, told: Array) -> Array:

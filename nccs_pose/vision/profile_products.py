@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from functools import cache
 import math
+from typing import NamedTuple
 
 import cv2
 from nccs_pose.geometry.pose import Array
@@ -38,10 +39,28 @@ _BLURRED = 9.0
 SHARP = 0.5
 
 
+class Reading(NamedTuple):
+    """The pixels nearest to a grid of P points over each of N bands.
+
+    :ivar channels: B, G and R, less ``floor`` (3, N, P).
+    :ivar floor: about the floor's colour (3,): numbers about zero keep their digits in sums of
+        squares.
+    :ivar place: of the pixels across the curve (N, P), px.
+    :ivar margin: of floor beyond the edges that the grid covers, px.
+    :ivar rows: of the grid along each station's piece of curve.
+    """
+
+    channels: NDArray[np.float32]
+    floor: NDArray[np.float32]
+    place: NDArray[np.float32]
+    margin: float
+    rows: int
+
+
 def read_pixels(
     image: NDArray[np.uint8], bands: Bands, margin: float, rows: int,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The pixels nearest to a grid over each band: values (P, N, 3) and place across s (P, N), px.
+) -> Reading:
+    """Read the pixels nearest to a grid over each band.
 
     All stations are read at one place of the grid before the next: what they show lies apart, so
     that the processor fetches it for several at a time.
@@ -69,7 +88,10 @@ def read_pixels(
     at *= terms[4]
     s = np.square(at.imag)
     s *= bend.astype(np.float32)
-    return values, np.subtract(at.real, s, out=s)
+    # The first pixel shows floor.
+    floor = values[0, 0].astype(np.float32)
+    channels = np.subtract(values.T, floor[:, None, None], dtype=np.float32)
+    return Reading(channels, floor, cv2.transpose(np.subtract(at.real, s, out=s)), margin, rows)
 
 
 @cache
@@ -92,9 +114,9 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 
 def profile_products(
-    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, across: Array,
+    channels: NDArray[np.float32], s: NDArray[np.float32], half_width: Array, across: Array,
     blur: float, members: int,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, NDArray[np.float32]]:
     """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
@@ -107,22 +129,21 @@ def profile_products(
     has hardly any. Otherwise a tape along the pixels' grid would seem to lie up to 0.06 px off,
     to and fro as it passes from row to row.
 
-    :param pixels: (P, N, 3) BGR.
-    :param s: their place across the curve (P, N), px.
+    :param channels: of the pixels (3, N, P).
+    :param s: their place across the curve (N, P), px.
     :param half_width: of the tape (N,), px.
     :param across: unit normal of the curve (N, 2).
     :param blur: standard deviation of the edges' blur, px.
     :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (7, 8, G); those with D of each station (8, N); and the colour (3,) that
-        the channels are less, about that of the floor.
+        over each group (7, 8, G); and all of them and 1 by stations (8, N, P).
     """
-    count, n = s.shape
+    n, count = s.shape
     rows = np.empty((8, n, count), np.float32)
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(cv2.transpose(s), 1.0 / blur, out=place)
+    np.multiply(s, 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
@@ -145,16 +166,18 @@ def profile_products(
     if sharp is not None:
         for row, more in zip((rows[0], rows[1], rows[3]), sharp):
             row += more
-    # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
-    less = pixels[0, 0].astype(np.float32)
-    np.subtract(pixels.T, less[:, None, None], out=rows[4:7])
+    rows[4:7] = channels
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     grouped = rows.reshape(8, -1, members * count)
     pooled = grouped[:7].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
+    return pooled.transpose(1, 2, 0).astype(float, order='C'), rows
+
+
+def products_by_shift(rows: NDArray[np.float32]) -> Array:
+    """Products of all rows (8, N, P) with D of each station (8, N)."""
     by_shift = (rows.transpose(1, 0, 2) @ rows[1, :, :, None])[..., 0]
-    return (pooled.transpose(1, 2, 0).astype(float, order='C'),
-            by_shift.T.astype(float, order='C'), less)
+    return by_shift.T.astype(float, order='C')
 
 
 def _edgeworth(

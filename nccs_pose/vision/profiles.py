@@ -32,7 +32,14 @@ from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.median import upper_median
-from nccs_pose.vision.profile_products import profile_products, read_pixels, SHARP, unit
+from nccs_pose.vision.profile_products import (
+    products_by_shift,
+    profile_products,
+    read_pixels,
+    Reading,
+    SHARP,
+    unit,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,60 +91,104 @@ class ProfileFit:
     found: NDArray[np.bool_]
 
 
-def fit_profiles(
+def read_bands(
     image: NDArray[np.uint8], bands: Bands, colour: LineColour, *, rough: bool = False,
-) -> tuple[ProfileFit, LineColour]:
-    """Fit each station's profile, and learn how tapes look in this image.
+) -> Reading:
+    """Read the pixels that :func:`fit_profiles` fits.
 
     :param image: (H, W, 3) BGR.
-    :param colour: what the tapes' contrast and blur are expected to be.
-    :param rough: look at some of the pixels only, and learn nothing.
+    :param colour: as expected; how blurred tapes are says how many pixels tell of them.
+    :param rough: read some of the pixels only.
     """
-    blur = max(colour.blur, ROUGH_BLUR) if rough else colour.blur
+    blur = _template_blur(colour, rough)
     margin = _MARGIN_PX + _MARGIN_BLURS * blur
     density = _ROUGH_DENSITY if rough else max(
         min(_DENSITY, _DENSITY_BLUR / blur), _LEAST_DENSITY)
     rows = max(min(round(density * float(bands.spacing.sum()) / len(bands)), _MOST_ALONG), 1)
-    pixels, s = read_pixels(image, bands, margin, rows)
-    pooled, by_shift, less = profile_products(
-        pixels, s, bands.half_width, bands.across, blur, bands.members)
-    count = len(s)
-    system = _eliminated(pooled, bands.members * count)
+    return read_pixels(image, bands, margin, rows)
+
+
+def fit_profiles(
+    reading: Reading, bands: Bands, colour: LineColour, *, rough: bool = False,
+) -> tuple[ProfileFit, LineColour]:
+    """Fit each station's profile, and learn how tapes look in this image.
+
+    :param reading: of these bands.
+    :param colour: what the tapes' contrast and blur are expected to be.
+    :param rough: learn nothing, and take a softer template.
+    """
+    blur = _template_blur(colour, rough)
+    pooled, rows = profile_products(
+        reading.channels, reading.place, bands.half_width, bands.across, blur, bands.members)
+    system = _eliminated(pooled, bands.members * rows.shape[2])
     if not rough:
-        floor = less + system.floor.sum(axis=1) / system.floor.shape[1]
+        floor = reading.floor + system.floor.sum(axis=1) / system.floor.shape[1]
         colour = colour.learn(system.height, system.power, system.left, floor)
-    # Where the grid is finer than the pixels, across or along, each is counted several times.
-    half_width = bands.half_width[::bands.members]
-    repeats = np.maximum(rows / bands.spacing[::bands.members], 1.0) * np.maximum(
-        0.5 * count / rows / (half_width + margin), 1.0)
-    seen = _shifts(
-        pooled, by_shift, system, colour.discriminant, repeats, bands.label[::bands.members],
-        half_width)
-    fit, step = seen.fit, unit(blur)
-    if rough:
-        # A template softer than the edges by so much is felt from further away, and misses less.
-        gain = math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2))
-    else:
-        softer, misfit = 0.0, step * upper_median(np.abs(seen.shared))
-        # A template beside its tape would take the misfit for blur.
-        if misfit < _SHARP_PX * max(1.0, blur):
-            sharpened = colour.sharpen(seen.height, seen.softness, system.swept[3, 3], step)
-            # The blur seen holds half the square of the shift over the template's.
-            softer = sharpened.blur - blur - 0.5 * step**2 / blur * seen.beside
-            # What lies no better is smeared by its noise. Edges as soft move a template as told
-            # below, but one as soft as they would be noisier.
-            if misfit < _SHARP_PX:
-                colour = sharpened
-        # An edge of blur b' moves a template of blur b by sqrt(2 b^2 / (b^2 + b'^2)) of its
-        # shift, and leaves 1 less that of the template's derivative.
-        gain = 1.0 / (1.0 - 0.5 * min(softer / blur, 1.0))
-    gain *= step
-    # Blur draws a bent edge towards the inside of the bend.
-    drawn = 0.5 * colour.blur**2 * bands.bend
-    sigma = gain * fit.sigma
+    groups = _grouped(system, reading, bands, colour)
+    gain, colour = _gain(groups, system, colour, blur, rough)
+    by_station = _by_station(groups, pooled, products_by_shift(rows), colour.discriminant)
+    shift, sigma = gain * by_station
     if blur < SHARP:
         sigma = np.hypot(sigma, _grid_error(bands, blur))
-    return ProfileFit(gain * fit.shift - drawn, sigma, fit.found), colour
+    # Blur draws a bent edge towards the inside of the bend.
+    shift -= 0.5 * colour.blur**2 * bands.bend
+    return ProfileFit(shift, sigma, groups.found.repeat(bands.members)), colour
+
+
+def fit_again(
+    reading: Reading, bands: Bands, colour: LineColour, beside: Array, *, rough: bool = False,
+) -> tuple[Array, NDArray[np.bool_], LineColour]:
+    """Fit the profile of each group as a whole, from where a first fit has it.
+
+    A profile is true to small shifts only; measured again from there, nothing is left to miss.
+
+    :param reading: of these bands.
+    :param colour: as the first fit has learned it.
+    :param beside: how far beside the bands the tapes are expected (N,), px; less than the margin.
+    :param rough: as in the first fit.
+    :returns: shift of each group from the bands (G,), px; it is the mean of its stations', each
+        weighed by its variance; whether a tape is there at all (G,); and the blur learned.
+    """
+    blur = _template_blur(colour, rough)
+    place = reading.place - beside.astype(np.float32)[:, None]
+    pooled, rows = profile_products(
+        reading.channels, place, bands.half_width, bands.across, blur, bands.members)
+    system = _eliminated(pooled, bands.members * rows.shape[2])
+    groups = _grouped(system, reading, bands, colour)
+    gain, colour = _gain(groups, system, colour, blur, rough)
+    expected = beside - 0.5 * colour.blur**2 * bands.bend
+    shift = gain * groups.shared + expected.reshape(-1, bands.members).mean(axis=1)
+    return shift, groups.found, colour
+
+
+def _template_blur(colour: LineColour, rough: bool) -> float:
+    return max(colour.blur, ROUGH_BLUR) if rough else colour.blur
+
+
+def _gain(
+    groups: _Groups, system: _System, colour: LineColour, blur: float, rough: bool,
+) -> tuple[float, LineColour]:
+    """How many px a shift in units of D's comes to, and the colour with the blur learned.
+
+    :param blur: of the template, px.
+    """
+    step = unit(blur)
+    if rough:
+        # A template softer than the edges by so much is felt from further away, and misses less.
+        return step * math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2)), colour
+    softer, misfit = 0.0, step * upper_median(np.abs(groups.shared))
+    # A template beside its tape would take the misfit for blur.
+    if misfit < _SHARP_PX * max(1.0, blur):
+        sharpened = colour.sharpen(groups.height, groups.softness, system.swept[3, 3], step)
+        # The blur seen holds half the square of the shift over the template's.
+        softer = sharpened.blur - blur - 0.5 * step**2 / blur * groups.beside
+        # What lies no better is smeared by its noise. Edges as soft move a template as told
+        # below, but one as soft as they would be noisier.
+        if misfit < _SHARP_PX:
+            colour = sharpened
+    # An edge of blur b' moves a template of blur b by sqrt(2 b^2 / (b^2 + b'^2)) of its
+    # shift, and leaves 1 less that of the template's derivative.
+    return step / (1.0 - 0.5 * min(softer / blur, 1.0)), colour
 
 
 def _grid_error(bands: Bands, blur: float) -> Array:
@@ -201,38 +252,43 @@ def _eliminated(pooled: Array, size: int) -> _System:
     return _System(power, swept, slope_power, own_power, left / (size - 4))
 
 
-class _Seen(NamedTuple):
-    """What G groups and their stations say along a colour's discriminant.
+class _Groups(NamedTuple):
+    """What G groups say along a colour's discriminant; shifts in units of D's.
 
-    :ivar fit: of the stations.
-    :ivar shared: shift of each group as a whole (G,).
+    :ivar shared: shift of each (G,).
+    :ivar found: whether a tape is there at all (G,).
     :ivar height: contrast of each, whatever its shift (G,).
     :ivar softness: its product with B, less T (G,).
     :ivar beside: mean square of the shifts, less that of their noise.
+    :ivar base, tape, tilt: what its pixels are beside the tape, how much more on it, and how
+        they slope across (G,).
+    :ivar contrast: by which it turns products with D into shifts (G,).
+    :ivar noise: variance of these products over D's own with itself (G,), but for D's power.
     """
 
-    fit: ProfileFit
     shared: Array
+    found: NDArray[np.bool_]
     height: Array
     softness: Array
     beside: float
+    base: Array
+    tape: Array
+    tilt: Array
+    contrast: Array
+    noise: Array
 
 
-def _shifts(
-    pooled: Array, by_shift: Array, system: _System, weights: Array, repeats: Array,
-    label: NDArray[np.intp], half_width: Array,
-) -> _Seen:
-    """Shifts and their noise along a colour's discriminant, in units of D's.
-
-    :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
-    :param by_shift: the same of the stations with D (8, N).
-    :param weights: the discriminant (3,).
-    :param repeats: how often each pixel is among the samples of a group (G,).
-    :param label: line of each group (G,), ascending.
-    :param half_width: of its tape (G,), px.
-    """
+def _grouped(
+    system: _System, reading: Reading, bands: Bands, colour: LineColour,
+) -> _Groups:
+    """Shifts of the groups along a colour's discriminant."""
+    weights, count = colour.discriminant, reading.place.shape[1]
+    half_width, spacing = bands.half_width[::bands.members], bands.spacing[::bands.members]
+    # Where the grid is finer than the pixels, across or along, each is counted several times.
+    repeats = np.maximum(reading.rows / spacing, 1.0) * np.maximum(
+        0.5 * count / reading.rows / (half_width + reading.margin), 1.0)
     power, swept = system.power, system.swept
-    crossed, members = swept[1, 2], by_shift.shape[1] // len(power)
+    crossed = swept[1, 2]
     seen = weights @ swept[:, 4:]
     own, slope = seen[1], seen[2]
     squares = (weights[:, None] * weights).ravel()
@@ -251,29 +307,39 @@ def _shifts(
     moved = (own - share * slope) / shift_power
     beside = seen[7:] - swept[7:, 1] * moved
     a, told = beside[1], power / variance
-    level, certain = _levels(label, a, power, told, half_width)
+    level, certain = _levels(bands.label[::bands.members], a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
     # One group's contrast is noisy where the tape is thin; its neighbours know better.
     known = told * np.square(_CONTRAST_SPREAD * level)
     smooth = np.maximum((a * known + level) / (known + 1.0), 1e-9)
-    # What each station's pixels say to D beside the floor and the contrast of its group; the
-    # weighted mean over the group is the group's own shift.
-    groups = np.empty((5, len(power)))
-    tilt = np.subtract(believed * slope, share * moved, out=groups[2])
-    np.subtract(beside, swept[7:, 2] * tilt, out=groups[:2])
-    groups[3] = smooth
-    np.divide(variance * pooled[1, 1], shift_power, out=groups[4])
-    base, height, tilt, contrast, noise = groups.repeat(members, axis=1)
-    said = (weights.dot(by_shift[4:7]) - height * by_shift[0] - tilt * by_shift[2]
-            - base * by_shift[7])
-    own_power = np.maximum(by_shift[1], 1e-9)
-    told_px = own_power * contrast
+    tilt = believed * slope - share * moved
+    base, tape = beside - swept[7:, 2] * tilt
     # By what tells of the blur, and the contrasts that the shifts are of.
     total = swept[3, 3].dot(np.square(np.maximum(seen[8], 0.0)))
     off = swept[3, 3].dot(np.square(moved) - variance / shift_power)
-    return _Seen(
-        ProfileFit(said / told_px, np.sqrt(noise * own_power) / told_px, found.repeat(members)),
-        moved / smooth, seen[8], seen[3], max(float(off / max(total, 1e-9)), 0.0))
+    return _Groups(
+        moved / smooth, found, seen[8], seen[3], max(float(off / max(total, 1e-9)), 0.0),
+        base, tape, tilt, smooth, variance / shift_power)
+
+
+def _by_station(groups: _Groups, pooled: Array, by_shift: Array, weights: Array) -> Array:
+    """Shifts of N stations and their deviations (2, N), in units of D's.
+
+    What each station's pixels say to D beside the floor and the contrast of its group; the
+    weighted mean over the group is the group's own shift.
+
+    :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
+    :param by_shift: the same of the stations with D (8, N).
+    :param weights: the discriminant (3,).
+    """
+    members = by_shift.shape[1] // len(groups.base)
+    base, tape, tilt, contrast, noise = np.array([
+        groups.base, groups.tape, groups.tilt, groups.contrast, groups.noise * pooled[1, 1],
+    ]).repeat(members, axis=1)
+    said = (weights.dot(by_shift[4:7]) - tape * by_shift[0] - tilt * by_shift[2]
+            - base * by_shift[7])
+    own_power = np.maximum(by_shift[1], 1e-9)
+    return np.array([said, np.sqrt(noise * own_power)]) / (own_power * contrast)
 
 
 def _levels(
