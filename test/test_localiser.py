@@ -452,8 +452,9 @@ def test_a_pose_that_steps_to_and_fro_is_given_up_at_once(monkeypatch: pytest.Mo
     assert 3 <= len(passes) <= 5
 
 
+@pytest.mark.parametrize(('x', 'degrees'), [(0.002, -0.05), (0.004, 0.5), (-0.004, -0.5)])
 def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
-        monkeypatch: pytest.MonkeyPatch) -> None:
+        x: float, degrees: float, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = arena_scene(1280)
     pose = Pose2(0.3, -0.2, 0.7)
     image = render(scene, pose, np.random.default_rng(5))
@@ -461,8 +462,9 @@ def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
     right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
     assert right is not None
     passes = _passes(monkeypatch)
-    # As far off as wheels tell of a step, and several standard deviations.
-    off = pose @ Pose2(0.002, 0.0, math.radians(-0.05))
+    # As far off as wheels tell of a step, or a tenth of what it turns by, and several standard
+    # deviations.
+    off = pose @ Pose2(x, 0.0, math.radians(degrees))
     followed = aligner.align(image, off, right.colours, reach=0.0)
     assert followed is not None and len(passes) == 1
     error = followed.pose.minus(right.pose)

@@ -31,7 +31,7 @@ from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import CONTRASTS, LineColour
 from nccs_pose.vision.profile_search import search_profiles
-from nccs_pose.vision.profiles import fit_profiles, ProfileFit, read_bands
+from nccs_pose.vision.profiles import fit_again, fit_profiles, ProfileFit, read_bands
 from nccs_pose.vision.segment import chromatic_mask, find_blobs, hsv_mask
 import numpy as np
 import pytest
@@ -237,6 +237,28 @@ def test_noise_twice_as_strong_doubles_sigma() -> None:
         medians.append(float(np.median(fit.sigma)))
     assert medians[1] / medians[0] == pytest.approx(2.0, rel=0.25)
     assert medians[2] / medians[1] == pytest.approx(2.0, rel=0.25)
+
+
+@pytest.mark.parametrize('half_width', [0.5, 2.5])
+@pytest.mark.parametrize('blur', [0.4, 0.7, 1.4])
+def test_a_shift_measured_again_from_where_it_leads_is_whole(
+        blur: float, half_width: float) -> None:
+    image, colour = _tape(half_width, 0.13, blur=blur), replace(_colour(), blur=blur)
+    for _ in range(6):
+        _, colour = _fitted(image, _straight_bands(half_width, 0.13, 0.0), colour)
+    missed, left = [], []
+    for share in (0.6, 0.9):
+        shift = share * blur
+        bands = _straight_bands(half_width, 0.13, shift)
+        reading = read_bands(image, bands, colour)
+        first, learned = fit_profiles(reading, bands, colour)
+        mean = float(np.average(first.shift, weights=first.sigma**-2.0))
+        again, found, _ = fit_again(reading, bands, learned, np.full(len(bands), mean))
+        assert found.all()
+        missed.append(mean / shift - 1.0)
+        left.append(float(again.mean()) / shift - 1.0)
+    assert np.abs(missed).max() > 0.01
+    assert np.abs(left).max() < 0.005
 
 
 @pytest.mark.parametrize('blur', [1.5, 2.5])
