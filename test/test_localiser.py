@@ -462,8 +462,7 @@ def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
     right = aligner.align(image, pose, aligner.nominal_colours, reach=2.0)
     assert right is not None
     passes = _passes(monkeypatch)
-    # As far off as wheels tell of a step, or a tenth of what it turns by, and several standard
-    # deviations.
+    # As far off as wheels are after a step, and several standard deviations.
     off = pose @ Pose2(x, 0.0, math.radians(degrees))
     followed = aligner.align(image, off, right.colours, reach=0.0)
     assert followed is not None and len(passes) == 1
