@@ -39,6 +39,8 @@ from nccs_pose.geometry.pose import Pose2
 # only those apart that explain more than this of what should be seen and of what is, by three
 # lines or more, and no more where one that lies on it was refused.
 _PLAINLY_ALL = 0.9
+# Nor does it tell a pose from one that shows as much, or this part of it.
+_EQUALLY = 0.98
 _DOUBTFUL = Objection(
     'its lines lie badly on the image, and another pose shows about as much', hidden=True)
 _ON_A_CORNER = Objection(
@@ -76,9 +78,9 @@ class Rivals:
         map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
         pose has to show all the lines that should be in view. Too little may show the right one to
         lay it on the image, so a rival by strips is enough; but one that explains nearly all,
-        which leaves little to stand out by, is in doubt only where another shows more, or lies as
-        well. Two lines lie well on any corner, even on a sharp image; on a coarse one, on what is
-        no corner too. Where the image decides nothing there is no doubt.
+        which leaves little to stand out by, is in doubt only where another shows as much, or lies
+        as well. Two lines lie well on any corner, even on a sharp image; on a coarse one, on what
+        is no corner too. Where the image decides nothing there is no doubt.
 
         :param has_refused: whether a pose that lies on the image was refused.
         """
@@ -136,8 +138,8 @@ class Rivals:
     ) -> bool:
         """Whether a rival shows about as much, laid on the image, as a pose that holds.
 
-        :param least_score: that one which shows no more has to reach besides, for how well its
-            lines lie.
+        :param least_score: that one which shows less has to reach besides, for how well its lines
+            lie.
         """
         least = ABOUT_AS_MUCH * found.shown
         for reach in rival.reaches:
@@ -149,7 +151,7 @@ class Rivals:
             measured = self._judge.measured(
                 alignment, case.sight.segments, rival.kept(alignment.pose))
             if measured.shown >= least and (
-                    measured.score >= least_score or measured.shown > found.shown):
+                    measured.score >= least_score or measured.shown > _EQUALLY * found.shown):
                 return True
         return False
 
