@@ -472,6 +472,26 @@ def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
     assert error @ np.linalg.solve(right.covariance, error) < 1.0
 
 
+@pytest.mark.parametrize('reach', [2.0, 5.0])
+def test_no_image_is_read_for_a_pose_that_would_rest_on_too_little(
+        reach: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, pose = arena_scene(1280), Pose2(0.3, -0.2, 0.7)
+    tape = scene.line_map[0]
+    short = LineMap((replace(tape, end=tape.start + 0.35 * (tape.end - tape.start)),))
+    table = FloorTable(scene.rig, DEFAULTS.reach)
+    places = BandPredictor(table, short).places(pose, SPACING, DEFAULTS.stations)
+    assert len(places) > 40 and places.length < 150.0
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise AssertionError('the image is read')
+
+    monkeypatch.setattr('nccs_pose.estimation.measuring.read_bands', refused)
+    monkeypatch.setattr('nccs_pose.estimation.aligner.search_profiles', refused)
+    aligner = Aligner(table, short, DEFAULTS)
+    image = np.zeros((960, 1280, 3), dtype=np.uint8)
+    assert aligner.align(image, pose, aligner.nominal_colours, reach=reach) is None
+
+
 def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = Drive(replace(SCENE, line_map=RAILS), Pose2(8.0, 0.1, 0.05))
     options = LocaliserOptions(reach=3.0)

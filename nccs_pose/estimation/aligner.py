@@ -126,6 +126,9 @@ class Aligner:
         """
         pose = start
         if reach > LINEAR_PX:
+            # About as much is in view from where a search leads.
+            if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
+                return None
             searched = self._search(image, start, colours, reach, prior)
             if searched is None:
                 return None
@@ -134,7 +137,7 @@ class Aligner:
                     leaves_open(searched) or _near(pose, laid) or _near(pose, start)):
                 return None
         places = self._places(pose) if reach > 0.0 else self._places_near(pose)
-        if len(places) < LEAST_STATIONS:
+        if len(places) < LEAST_STATIONS or places.length < _LEAST_LENGTH:
             return None
         begun = self._begun(image, places, pose, prior, colours, reach)
         if begun is None:
@@ -216,7 +219,7 @@ class Aligner:
         """
         pose, attitude = start, np.zeros(3)
         inexact = _sharpest(colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
-        long = reach > 0.0 and float(places.spacing.sum()) > _LONG
+        long = reach > 0.0 and places.length > _LONG
         if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
             return pose, attitude, colours
         followed = reach == 0.0

@@ -62,6 +62,11 @@ class Places:
     def __len__(self) -> int:
         return len(self.number)
 
+    @property
+    def length(self) -> float:
+        """Of curve that all of them stand for, px."""
+        return float(self.spacing.sum())
+
     def every(self, step: int) -> Places:
         """One group out of so many."""
         at = np.arange(len(self)).reshape(-1, self.members)[step // 2::step].ravel()
