@@ -37,25 +37,26 @@ from numpy.typing import NDArray
 LEAST_STATIONS = 12
 # A profile is linear in its shift for about so many pixels.
 LINEAR_PX = 2.0
-
-
-# Which of some things: a mask, or a slice.
-Which = slice | NDArray[np.bool_]
-_ALL = slice(None)
 # A pass misses less than this part of the way to where it leads.
 _MOST_MISSED = 0.5
+
+# Some of a row of things: a slice, or a mask.
+Some = slice | NDArray[np.bool_]
+_ALL = slice(None)
 
 
 class Part(NamedTuple):
     """The stations of one colour.
 
     :ivar colour: its number.
-    :ivar own: which of all they are, and which groups.
+    :ivar own: which of all stations they are.
+    :ivar groups: which of all groups of stations.
+    :ivar bands: theirs.
     """
 
     colour: int
-    own: Which
-    groups: Which
+    own: Some
+    groups: Some
     bands: Bands
 
 
@@ -66,7 +67,7 @@ class Look:
     :ivar pose: T_map_base that predicts them.
     :ivar attitude: and the base's (z, roll, pitch) off its plane (3,), metres and rad.
     :ivar slide: d(their place across)/d(x, y, yaw, z, roll, pitch) (6, N), px per metre and rad.
-    :ivar read: what was read of each colour's.
+    :ivar read: the stations of each colour, and their pixels.
     :ivar rough: whether only some of the pixels are.
     """
 
