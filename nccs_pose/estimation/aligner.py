@@ -69,7 +69,8 @@ _MISSED_BEYOND = 0.05
 # Nor does a pass count that has just learned a blur so different, px: a template too soft or too
 # sharp takes a step for larger or smaller than it is.
 _LEARNED_BLUR = 0.1
-# Up to a step so large, px, what stations slide by is proportional to it.
+# Up to a step so large, px, what stations slide by is proportional to it: they are measured again
+# without a look at the image.
 _SLIDING_PX = 1.0
 # After a step larger than this the stations are chosen anew, px.
 _MOVED_PX = 3.0
@@ -176,7 +177,7 @@ class Aligner:
             before, pose, attitude = pose, result.pose, result.attitude
             if settled:
                 return measured.alignment
-            # Measured again, that part of that part is missed.
+            # Measured again, it misses that part of that part.
             if reach == 0.0 and steady and measured.moved < _SLIDING_PX and close(
                     pose, before, result.covariance, _FOLLOWED / part**2):
                 return self._measurer.measure_again(look, measured).alignment
@@ -223,7 +224,8 @@ class Aligner:
         if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
             return pose, attitude, colours
         followed = reach == 0.0
-        for k, step in enumerate(_SOME if long else _SOME[:1] * (1 + followed)):
+        # A robot that is followed may be so far off that it takes two.
+        for k, step in enumerate(_SOME[:1] * 2 if followed else _SOME[:1 + long]):
             sharpest = _sharpest(colours)
             look = self._measurer.look(
                 image, places.every(step), pose, attitude, colours,
