@@ -262,8 +262,8 @@ class _Groups(NamedTuple):
     :ivar beside: mean square of the shifts, less that of their noise.
     :ivar base, tape, tilt: what its pixels are beside the tape, how much more on it, and how
         they slope across (G,).
-    :ivar contrast: by which it turns products with D into shifts (G,).
-    :ivar noise: variance of these products over D's own with itself (G,), but for D's power.
+    :ivar contrast: that its shift is of (G,).
+    :ivar noise: variance of its shift, times the square of that (G,).
     """
 
     shared: Array
