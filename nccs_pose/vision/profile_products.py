@@ -42,16 +42,13 @@ SHARP = 0.5
 class Reading(NamedTuple):
     """The pixels nearest to a grid of P points over each of N bands.
 
-    :ivar channels: B, G and R, less ``floor`` (3, N, P).
-    :ivar floor: about the floor's colour (3,): numbers about zero keep their digits in sums of
-        squares.
-    :ivar place: of the pixels across the curve (N, P), px.
+    :ivar values: BGR (P, N, 3).
+    :ivar place: of the pixels across the curve (P, N), px.
     :ivar margin: of floor beyond the edges that the grid covers, px.
     :ivar rows: of the grid along each station's piece of curve.
     """
 
-    channels: NDArray[np.float32]
-    floor: NDArray[np.float32]
+    values: NDArray[np.uint8]
     place: NDArray[np.float32]
     margin: float
     rows: int
@@ -88,10 +85,7 @@ def read_pixels(
     at *= terms[4]
     s = np.square(at.imag)
     s *= bend.astype(np.float32)
-    # The first pixel shows floor.
-    floor = values[0, 0].astype(np.float32)
-    channels = np.subtract(values.T, floor[:, None, None], dtype=np.float32)
-    return Reading(channels, floor, cv2.transpose(np.subtract(at.real, s, out=s)), margin, rows)
+    return Reading(values, np.subtract(at.real, s, out=s), margin, rows)
 
 
 @cache
@@ -114,9 +108,9 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 
 def profile_products(
-    channels: NDArray[np.float32], s: NDArray[np.float32], half_width: Array, across: Array,
+    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, across: Array,
     blur: float, members: int,
-) -> tuple[Array, NDArray[np.float32]]:
+) -> tuple[Array, NDArray[np.float32], Array]:
     """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
@@ -129,21 +123,22 @@ def profile_products(
     has hardly any. Otherwise a tape along the pixels' grid would seem to lie up to 0.06 px off,
     to and fro as it passes from row to row.
 
-    :param channels: of the pixels (3, N, P).
-    :param s: their place across the curve (N, P), px.
+    :param pixels: (P, N, 3) BGR.
+    :param s: their place across the curve (P, N), px.
     :param half_width: of the tape (N,), px.
     :param across: unit normal of the curve (N, 2).
     :param blur: standard deviation of the edges' blur, px.
     :param members: stations of each group, one after the other.
     :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (7, 8, G); and all of them and 1 by stations (8, N, P).
+        over each group (7, 8, G); all of them and 1 by stations (8, N, P); and the colour (3,)
+        that the channels are less, about that of the floor.
     """
-    n, count = s.shape
+    count, n = s.shape
     rows = np.empty((8, n, count), np.float32)
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(s, 1.0 / blur, out=place)
+    np.multiply(cv2.transpose(s), 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
@@ -166,12 +161,14 @@ def profile_products(
     if sharp is not None:
         for row, more in zip((rows[0], rows[1], rows[3]), sharp):
             row += more
-    rows[4:7] = channels
+    # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
+    less = pixels[0, 0].astype(np.float32)
+    np.subtract(pixels.T, less[:, None, None], out=rows[4:7])
     rows[7] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
     grouped = rows.reshape(8, -1, members * count)
     pooled = grouped[:7].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
-    return pooled.transpose(1, 2, 0).astype(float, order='C'), rows
+    return pooled.transpose(1, 2, 0).astype(float, order='C'), rows, less
 
 
 def products_by_shift(rows: NDArray[np.float32]) -> Array:

@@ -118,11 +118,11 @@ def fit_profiles(
     :param rough: learn nothing, and take a softer template.
     """
     blur = _template_blur(colour, rough)
-    pooled, rows = profile_products(
-        reading.channels, reading.place, bands.half_width, bands.across, blur, bands.members)
+    pooled, rows, less = profile_products(
+        reading.values, reading.place, bands.half_width, bands.across, blur, bands.members)
     system = _eliminated(pooled, bands.members * rows.shape[2])
     if not rough:
-        floor = reading.floor + system.floor.sum(axis=1) / system.floor.shape[1]
+        floor = less + system.floor.sum(axis=1) / system.floor.shape[1]
         colour = colour.learn(system.height, system.power, system.left, floor)
     groups = _grouped(system, reading, bands, colour)
     gain, colour = _gain(groups, system, colour, blur, rough)
@@ -150,9 +150,9 @@ def fit_again(
         weighed by its variance; whether a tape is there at all (G,); and the blur learned.
     """
     blur = _template_blur(colour, rough)
-    place = reading.place - beside.astype(np.float32)[:, None]
-    pooled, rows = profile_products(
-        reading.channels, place, bands.half_width, bands.across, blur, bands.members)
+    place = reading.place - beside.astype(np.float32)
+    pooled, rows, _ = profile_products(
+        reading.values, place, bands.half_width, bands.across, blur, bands.members)
     system = _eliminated(pooled, bands.members * rows.shape[2])
     groups = _grouped(system, reading, bands, colour)
     gain, colour = _gain(groups, system, colour, blur, rough)
@@ -282,7 +282,7 @@ def _grouped(
     system: _System, reading: Reading, bands: Bands, colour: LineColour,
 ) -> _Groups:
     """Shifts of the groups along a colour's discriminant."""
-    weights, count = colour.discriminant, reading.place.shape[1]
+    weights, count = colour.discriminant, len(reading.place)
     half_width, spacing = bands.half_width[::bands.members], bands.spacing[::bands.members]
     # Where the grid is finer than the pixels, across or along, each is counted several times.
     repeats = np.maximum(reading.rows / spacing, 1.0) * np.maximum(
