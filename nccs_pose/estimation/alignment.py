@@ -133,7 +133,7 @@ class Pass:
     @cached_property
     def alignment(self) -> Alignment:
         """What it comes to if it is the last."""
-        return alignment_of(self)
+        return _alignment_of(self)
 
     @property
     def length(self) -> float:
@@ -141,7 +141,7 @@ class Pass:
         return float(self.bands.spacing.take(self.used).sum())
 
 
-def alignment_of(measured: Pass) -> Alignment:
+def _alignment_of(measured: Pass) -> Alignment:
     """What a last pass comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
     lines = measured.lines
