@@ -486,7 +486,7 @@ def test_no_image_is_read_for_a_pose_that_would_rest_on_too_little(
         raise AssertionError('the image is read')
 
     monkeypatch.setattr('nccs_pose.estimation.measuring.read_bands', refused)
-    monkeypatch.setattr('nccs_pose.estimation.aligner.search_profiles', refused)
+    monkeypatch.setattr('nccs_pose.estimation.measuring.search_profiles', refused)
     aligner = Aligner(table, short, DEFAULTS)
     image = np.zeros((960, 1280, 3), dtype=np.uint8)
     assert aligner.align(image, pose, aligner.nominal_colours, reach=reach) is None

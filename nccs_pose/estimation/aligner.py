@@ -24,12 +24,10 @@ from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import Places
-from nccs_pose.estimation.refine import Refinement
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.profile_search import search_profiles
 from nccs_pose.vision.profiles import ROUGH_BLUR
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +41,9 @@ _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
 # Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
 # first, rough pass takes one station of so many. On more curve than this, px, these few show what
-# tapes look like as well, and a second pass takes some too. A search takes so many of each line,
-# this far apart (px) or more.
+# tapes look like as well, and a second pass takes some too.
 _SOME = (4, 2)
 _LONG = 2000.0
-_SEARCHED = 25
-_SEARCHED_SPACING = 8.0
 # What a first pass moves a start by more than this, px, that should be off by less than that, is
 # nowhere near.
 _ASTRAY_PX = 5.0
@@ -130,7 +125,7 @@ class Aligner:
             # About as much is in view from where a search leads.
             if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
                 return None
-            searched = self._search(image, start, colours, reach, prior)
+            searched = self._measurer.search(image, start, prior, colours, reach)
             if searched is None:
                 return None
             pose = searched.pose
@@ -248,25 +243,6 @@ class Aligner:
             if near and _is_steady(known, colours):
                 break
         return pose, attitude, colours
-
-    def _search(
-        self, image: NDArray[np.uint8], start: Pose2, colours: tuple[LineColour, ...],
-        reach: float, prior: tuple[Pose2, Array] | None,
-    ) -> Refinement | None:
-        places = self._measurer.predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
-        bands, slide = self._measurer.predictor.bands(places, start)
-        shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
-        for part in self._measurer.parts(bands):
-            if len(part.bands) >= LEAST_STATIONS:
-                fit = search_profiles(image, part.bands, colours[part.colour], reach)
-                shift[part.own], found[part.own] = fit.shift, fit.found
-        index, = found.nonzero()
-        if len(index) < LEAST_STATIONS:
-            return None
-        measured = shift[index]
-        return self._measurer.weigh(
-            measured, np.ones(len(index)), slide[index], index, bands, start, prior,
-        ).solve(measured)
 
 
 def _near(a: Pose2, b: Pose2) -> bool:

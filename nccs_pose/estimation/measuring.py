@@ -22,6 +22,7 @@ from typing import NamedTuple
 from nccs_pose.estimation.alignment import Pass
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.shift_solve import weigh_shifts, WeighedShifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -29,6 +30,7 @@ from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.profile_products import Reading
+from nccs_pose.vision.profile_search import search_profiles
 from nccs_pose.vision.profiles import fit_again, fit_profiles, ProfileFit, read_bands
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +39,9 @@ from numpy.typing import NDArray
 LEAST_STATIONS = 12
 # A profile is linear in its shift for about so many pixels.
 LINEAR_PX = 2.0
+# A search takes so many stations of each line, this far apart (px) or more.
+_SEARCHED = 25
+_SEARCHED_SPACING = 8.0
 # A pass misses less than this part of the way to where it leads.
 _MOST_MISSED = 0.5
 
@@ -98,14 +103,6 @@ class Measurer:
         self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
         self.nominal_colours = tuple(LineColour.nominal(name, options.blur) for name in names)
 
-    def parts(self, bands: Bands) -> list[Part]:
-        """The stations of each colour that any have."""
-        if len(self.nominal_colours) == 1:
-            return [Part(0, _ALL, _ALL, bands)]
-        colour = self._colour_of_line[bands.label]
-        return [Part(k, colour == k, (colour == k)[::bands.members], bands[colour == k])
-                for k in np.unique(colour).tolist()]
-
     def look(
         self, image: NDArray[np.uint8], places: Places, pose: Pose2, attitude: Array,
         colours: tuple[LineColour, ...], *, rough: bool = False,
@@ -121,7 +118,7 @@ class Measurer:
             return None
         read = tuple(
             (part, read_bands(image, part.bands, colours[part.colour], rough=rough))
-            for part in self.parts(bands))
+            for part in self._parts(bands))
         return Look(pose, attitude, bands, slide.T, read, rough)
 
     def measure(
@@ -142,7 +139,7 @@ class Measurer:
         used, = felt.nonzero()
         if len(used) < LEAST_STATIONS:
             return None
-        weighed = self.weigh(
+        weighed = self._weigh(
             (shift + look.attitude.dot(slide[3:])).take(used), sigma.take(used),
             slide.take(used, axis=1).T, used, bands, look.pose, prior)
         return self._pass(look, weighed, ProfileFit(shift, sigma, found), used, tuple(learned))
@@ -169,6 +166,37 @@ class Measurer:
         return self._pass(
             look, first.weighed, replace(fit, shift=shift), first.used, tuple(colours))
 
+    def search(
+        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        colours: tuple[LineColour, ...], reach: float,
+    ) -> Refinement | None:
+        """Look for the tapes up to so many pixels beside where a pose predicts them, and solve.
+
+        :returns: None where too few stations show one.
+        """
+        places = self.predictor.places(start, _SEARCHED_SPACING, _SEARCHED)
+        bands, slide = self.predictor.bands(places, start)
+        shift, found = np.zeros(len(bands)), np.zeros(len(bands), dtype=bool)
+        for part in self._parts(bands):
+            if len(part.bands) >= LEAST_STATIONS:
+                fit = search_profiles(image, part.bands, colours[part.colour], reach)
+                shift[part.own], found[part.own] = fit.shift, fit.found
+        index, = found.nonzero()
+        if len(index) < LEAST_STATIONS:
+            return None
+        measured = shift[index]
+        return self._weigh(
+            measured, np.ones(len(index)), slide[index], index, bands, start, prior,
+        ).solve(measured)
+
+    def _parts(self, bands: Bands) -> list[Part]:
+        """The stations of each colour that any have."""
+        if len(self.nominal_colours) == 1:
+            return [Part(0, _ALL, _ALL, bands)]
+        colour = self._colour_of_line[bands.label]
+        return [Part(k, colour == k, (colour == k)[::bands.members], bands[colour == k])
+                for k in np.unique(colour).tolist()]
+
     def _pass(
         self, look: Look, weighed: WeighedShifts, fit: ProfileFit, used: NDArray[np.intp],
         colours: tuple[LineColour, ...],
@@ -180,7 +208,7 @@ class Measurer:
         return Pass(weighed, refinement, look.bands, fit, used, float(np.abs(moved).max()), leant,
                     colours, self._lines)
 
-    def weigh(
+    def _weigh(
         self, shift: Array, sigma: Array, slide: Array, index: NDArray[np.intp], bands: Bands,
         start: Pose2, prior: tuple[Pose2, Array] | None,
     ) -> WeighedShifts:
