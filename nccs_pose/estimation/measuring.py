@@ -204,7 +204,7 @@ class Measurer:
         by_attitude = look.slide[3:]
         refinement = weighed.solve((fit.shift + look.attitude.dot(by_attitude)).take(used))
         leant = (refinement.attitude - look.attitude).dot(by_attitude)
-        moved = refinement.pose.minus(look.pose).dot(look.slide[:3]) + leant
+        moved = look.beside(refinement.pose, refinement.attitude)
         return Pass(weighed, refinement, look.bands, fit, used, float(np.abs(moved).max()), leant,
                     colours, self._lines)
 
