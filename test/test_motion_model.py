@@ -117,25 +117,51 @@ def test_a_steady_motion_is_predicted_from_two_poses() -> None:
         poses = [integrate_twist(START, twist, 0.1 * k) for k in range(3)]
         before, last = (
             _track(k * SECOND // 10, poses[k], 1e-6 * np.eye(3)) for k in (0, 1))
-        prediction = by_velocity(before, last, SECOND // 5)
+        prediction = by_velocity((before,), last, SECOND // 5)
         assert prediction is not None
         moved, turned = _difference(prediction.pose, poses[2])
         assert moved <= moved_limit
         assert turned < 1e-9
 
 
+def test_a_velocity_that_changes_steadily_goes_on_to_change() -> None:
+    """Against the closed form of constant accelerations, at uneven stamps."""
+    stamps = (0.0, 0.1, 0.25, 0.3, 0.42)
+    # Straight ahead, so that poses are plain sums; turning on the spot.
+    for acceleration in (np.array([0.8, 0.0, 0.0]), np.array([0.0, 0.0, -1.5])):
+        poses = [Pose2(*(np.array([0.3, 0.0, 0.4]) * (acceleration != 0.0) * t
+                         + 0.5 * acceleration * t**2)) for t in stamps]
+        tracks = [_track(round(t * SECOND), pose, 1e-6 * np.eye(3))
+                  for t, pose in zip(stamps, poses)]
+        prediction = by_velocity(tracks[:3], tracks[3], tracks[4].stamp_ns)
+        assert prediction is not None
+        assert _difference(prediction.pose, poses[4]) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize('way', [
+    # It halts; it stood and sets off; it drives to and fro.
+    (0.0, 0.1, 0.2, 0.2, 0.2), (0.0, 0.0, 0.0, 0.1, 0.2), (0.0, 0.1, 0.0, 0.1, 0.2)])
+def test_a_jerk_does_not_go_on(way: tuple[float, ...]) -> None:
+    tracks = [_track(k * SECOND // 10, Pose2(x, 0.0, x), 1e-6 * np.eye(3))
+              for k, x in enumerate(way)]
+    prediction = by_velocity(tracks[:3], tracks[3], tracks[4].stamp_ns)
+    assert prediction is not None
+    # From so small a turn on, the chord of an arc stands for it.
+    assert prediction.pose.yaw == pytest.approx(2.0 * way[3] - way[2], abs=1e-12)
+
+
 def test_an_old_velocity_is_not_believed() -> None:
     before, last = _track(0, START, np.eye(3)), START @ Pose2(0.1, 0.0, 0.0)
-    assert by_velocity(before, _track(SECOND // 2, last, np.eye(3)), SECOND) is not None
-    assert by_velocity(before, _track(SECOND // 2, last, np.eye(3)), 2 * SECOND) is None
-    assert by_velocity(before, _track(3 * SECOND, last, np.eye(3)), 3 * SECOND + 1) is None
+    assert by_velocity((before,), _track(SECOND // 2, last, np.eye(3)), SECOND) is not None
+    assert by_velocity((before,), _track(SECOND // 2, last, np.eye(3)), 2 * SECOND) is None
+    assert by_velocity((before,), _track(3 * SECOND, last, np.eye(3)), 3 * SECOND + 1) is None
     still = _track(SECOND // 2, last, np.eye(3))
-    assert by_velocity(before, still, SECOND // 2) is None, 'no time has passed'
+    assert by_velocity((before,), still, SECOND // 2) is None, 'no time has passed'
 
 
 def test_without_a_velocity_the_robot_may_have_gone_anywhere_near() -> None:
     last = _track(SECOND, START, 1e-6 * np.eye(3))
-    prediction = by_velocity(None, last, SECOND + SECOND // 10)
+    prediction = by_velocity((), last, SECOND + SECOND // 10)
     assert prediction is not None
     assert prediction.pose == START
     # A robot at 1 m/s and 2 rad/s is one deviation away.
@@ -149,14 +175,14 @@ def test_a_direction_out_of_sight_grows_uncertain_since_it_was_last_seen() -> No
     deviations = []
     for seen_ns in (SECOND, SECOND // 2, SECOND // 4):
         last = _track(SECOND, START @ Pose2(0.1, 0.0, 0.0), 1e-6 * np.eye(3), seen_ns)
-        prediction = by_velocity(before, last, SECOND + SECOND // 10)
+        prediction = by_velocity((before,), last, SECOND + SECOND // 10)
         assert prediction is not None
         deviations.append(float(np.sqrt(prediction.carried[0, 0])))
     assert deviations[0] < deviations[1] < deviations[2]
     # Half of 1 m/s^2 for 0.85 s, and as much again from the velocity's own second.
     assert deviations[2] == pytest.approx(0.5 * 0.85 * 1.85, rel=0.01)
     unseen = _track(SECOND, START, 1e-6 * np.eye(3), 0)
-    assert by_velocity(before, unseen, SECOND + SECOND // 10) is None
+    assert by_velocity((before,), unseen, SECOND + SECOND // 10) is None
 
 
 def test_the_floor_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
@@ -199,6 +225,6 @@ def test_what_a_prediction_may_be_off_by_grows_with_the_motion() -> None:
     assert 0.03 < sizes[2][0] < 0.06
     before, last = _track(0, START, zero), _track(SECOND // 2, START @ Pose2(0.1, 0.0, 0.0), zero)
     soon, later = (
-        by_velocity(before, last, SECOND // 2 + dt) for dt in (SECOND // 10, SECOND // 2))
+        by_velocity((before,), last, SECOND // 2 + dt) for dt in (SECOND // 10, SECOND // 2))
     assert soon is not None and later is not None
     assert (np.diag(later.covariance) > np.diag(soon.covariance)).all()

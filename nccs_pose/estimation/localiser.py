@@ -45,7 +45,14 @@ from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAS
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
-from nccs_pose.estimation.motion import by_odometry, by_velocity, Odometry, Prediction, Track
+from nccs_pose.estimation.motion import (
+    by_odometry,
+    by_velocity,
+    Odometry,
+    PAST,
+    Prediction,
+    Track,
+)
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.rivals import Rivals
@@ -125,7 +132,7 @@ class Localiser:
         How blurred the images are is remembered: the lens stays the same.
         """
         self._track: Track | None = None
-        self._before: Track | None = None
+        self._past: tuple[Track, ...] = ()
         self._prior: tuple[Pose2, Array] | None = None
         self._ever_tracked = False
         self._follower.begin()
@@ -192,12 +199,12 @@ class Localiser:
         return self._search(stamp_ns, image, prediction, followed, watch)
 
     def _predict(self, stamp_ns: int) -> Prediction | None:
-        track, before = self._track, self._before
+        track = self._track
         if track is None:
             return None
         if track.odometry is not None and self._now is not None:
             return by_odometry(track.pose, track.covariance, track.odometry, self._now)
-        return by_velocity(before, track, stamp_ns)
+        return by_velocity(self._past, track, stamp_ns)
 
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
@@ -291,7 +298,8 @@ class Localiser:
         if unobserved and self._track is not None:
             seen_ns = self._track.seen_ns
         # No velocity leads across a jump.
-        self._before = None if self._open else self._track
+        self._past = () if self._open or self._track is None else (
+            *self._past, self._track)[-PAST:]
         self._track = Track(
             stamp_ns, alignment.pose, covariance, self._now, seen_ns)
         self._colours = alignment.colours

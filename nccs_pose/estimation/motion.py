@@ -17,8 +17,10 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 import math
 
 from nccs_pose.errors import FrameRefusedError
@@ -46,6 +48,8 @@ _YAW_PER_RADIAN = 0.05
 # Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
 _SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
+# So many poses before the last one show how the velocity changes.
+PAST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,29 +188,52 @@ def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> 
     return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
 
 
-def by_velocity(before: Track | None, last: Track, stamp_ns: int) -> Prediction | None:
-    """Carry a pose on by the velocity between the last two; None when that is too long ago.
+def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction | None:
+    """Carry a pose on by its last velocity, and how that changes; None when it is too long ago.
 
     A direction that no image has fixed for a while is as uncertain as any acceleration since
     then could make it; without a velocity, as any speed could.
+
+    :param past: the poses before the last one, in order; from PAST on its change is known.
     """
     dt, blind = (stamp_ns - last.stamp_ns) * 1e-9, (stamp_ns - last.seen_ns) * 1e-9
     if not 0.0 < dt <= blind <= _LONGEST_COAST:
         return None
-    if before is None:
+    if not past:
         sigma, sigma_yaw = (speed * blind for speed in _SPEED)
         return Prediction(last.pose, _carried(
             last.pose, last.covariance, last.pose, sigma, sigma_yaw), False)
-    past = (last.stamp_ns - before.stamp_ns) * 1e-9
-    if not 0.0 < past <= _LONGEST_COAST:
+    tracks = (*past[-PAST:], last)
+    seconds = [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairwise(tracks)]
+    before = seconds[-1]
+    if not 0.0 < before <= _LONGEST_COAST:
         return None
-    twist = before.pose.inverse() @ last.pose
-    share = dt / past
-    step = Pose2(share * twist.x, share * twist.y, share * twist.yaw)
-    moved = last.pose @ step
-    sigma, sigma_yaw = (0.5 * a * blind * (blind + past) for a in _ACCELERATION)
+    velocities = [_step(a.pose, b.pose) / time for (a, b), time in zip(pairwise(tracks), seconds)]
+    velocity = velocities[-1]
+    if len(velocities) == PAST:
+        velocity = velocity + 0.5 * (before + dt) * _going_on(*(
+            2.0 * (v - u) / (s + t)
+            for (u, v), (s, t) in zip(pairwise(velocities), pairwise(seconds))))
+    moved = last.pose @ Pose2(*(dt * velocity).tolist())
+    sigma, sigma_yaw = (0.5 * a * blind * (blind + before) for a in _ACCELERATION)
     return Prediction(
         moved, _carried(last.pose, last.covariance, moved, sigma, sigma_yaw), False)
+
+
+def _step(before: Pose2, after: Pose2) -> Array:
+    """The motion (x, y, yaw) from one pose to another, seen from the first (3,)."""
+    step = before.inverse() @ after
+    return np.array([step.x, step.y, step.yaw])
+
+
+def _going_on(first: Array, second: Array) -> Array:
+    """The change of velocity that goes on, of the last two in turn (3,), m/s^2 and rad/s^2.
+
+    It is the last, but no more than twice the one before, and nothing where their signs differ:
+    what a robot begins or ends at once, as it halts, leads nowhere.
+    """
+    lesser = np.sign(second) * np.minimum(2.0 * np.abs(first), np.abs(second))
+    return np.where(first * second > 0.0, lesser, 0.0)
 
 
 def _carried(
