@@ -24,6 +24,8 @@ from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.many_poses import Poses, same_pose
 from nccs_pose.estimation.nearest_lines import NearestLines
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.files.yaml_files import load_map
@@ -510,6 +512,24 @@ def test_one_blob_over_two_crossing_tapes_is_split(table: FloorTable) -> None:
         on = [s for s in strips if _lies_on(s, line, HERE) < 0.04]
         assert len(on) == 1
         assert np.linalg.norm(on[0].end - on[0].start) == pytest.approx(line.length, abs=0.12)
+
+
+def test_which_part_of_the_colour_lies_on_lines_at_a_pose(table: FloorTable) -> None:
+    """Against the pixels that each of two tapes has when it lies there alone."""
+    def masks(line_map: LineMap) -> dict[str, np.ndarray]:
+        image = render(replace(ideal_scene(640, noise=0.01), line_map=line_map), HERE,
+                       np.random.default_rng(0))
+        return both.masks(image)
+
+    apart = LineMap((_line((-1.0, 0.9), (1.2, 1.1)), _line((0.4, -0.3), (0.1, -1.5))))
+    both, one = (Searcher(table, m, LocaliserOptions()) for m in (apart, LineMap(apart[:1])))
+    counts = [np.count_nonzero(masks(LineMap((line,)))['green']) for line in apart]
+    seen = masks(apart)
+    assert both.on_lines(HERE, seen) > 0.98
+    assert one.on_lines(HERE, seen) == pytest.approx(counts[0] / sum(counts), abs=0.02)
+    assert 0.3 < counts[0] / sum(counts) < 0.7
+    assert both.on_lines(HERE @ Pose2(0.1, 0.1, 0.3), seen) < 0.2
+    assert both.on_lines(HERE, {'green': np.zeros_like(seen['green'])}) == 1.0
 
 
 def test_touching_tapes_are_split(table: FloorTable) -> None:

@@ -666,6 +666,32 @@ def test_a_tracked_pose_that_explains_the_image_is_kept() -> None:
         assert drive.right(drive.go(Pose2(0.05, 0.0, 0.1)))
 
 
+def test_a_pose_that_explains_less_than_another_is_given_up() -> None:
+    """The middle of this track looks the same from two places; one of its ends does not."""
+    rails = (_line((-4.0, -1.4), (4.0, -1.4)), _line((-4.0, 1.4), (4.0, 1.4)))
+    sleepers = (_line((x, -1.4), (x + lean, 1.4))
+                for x, lean in ((-1.0, 0.0), (1.0, 0.0), (2.7, 0.0), (2.7, 0.7), (3.4, 0.0)))
+    drive = Drive(replace(SCENE, line_map=LineMap((*rails, *sleepers))), Pose2(0.1, 0.0, 0.0),
+                  LocaliserOptions(reach=2.2, check_every=5))
+    twin = Pose2(-drive.pose.x, -drive.pose.y, math.pi)
+    drive.localiser.set_prior(twin, np.diag([0.1, 0.1, 0.1]) ** 2)
+    first = drive.go()
+    assert first.pose is not None
+    assert _near(first.pose, twin)
+    answers = []
+    for _ in range(28):
+        answers.append(drive.go(Pose2(0.1, 0.0, 0.0)))
+        if answers[-1].state is not State.TRACKING:
+            break
+    # The end is what is seen of it and cannot be there, not what is missing.
+    assert answers[-1].pose is None
+    assert 'another place than expected' in answers[-1].reason
+    assert np.nanmin([answer.quality.claimed for answer in answers[:-1]]) < 0.9
+    # From then on no image is laid on the twin again.
+    for _ in range(6):
+        assert drive.right(drive.go(Pose2(0.02, 0.0, 0.0)))
+
+
 @pytest.mark.parametrize('line', [
     Line(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), name='odd one'),
     Line(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), name='odd one'),

@@ -26,6 +26,7 @@ import math
 from typing import NamedTuple
 
 from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.floor_points import half_strip
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
@@ -34,10 +35,11 @@ from nccs_pose.estimation.strip_scores import Place, StripScorer
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.floor_table import Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
+from numpy.typing import NDArray
 
 # Pairs of strips that start hypotheses; of these so many are looked at closely, by every third
 # sample of the strips, and so many are refined. No more than these are candidates.
@@ -147,6 +149,24 @@ class Associator:
                    np.array([complex(pose.x, pose.y)]))
         claimed = scorer.claimed(at)
         return float(_harmonic(claimed, scorer.explained(at))[0]), float(claimed[0])
+
+    def on_lines(
+        self, pose: Pose2, floor: Complex, spread: Array, width: float, colour: str,
+    ) -> NDArray[np.bool_]:
+        """Which of some pixels a pose has on map lines of a colour (P,).
+
+        :param floor: behind them, x + iy (P,), metres in base_link.
+        :param spread: xx, xy and yy of J J^T (P, 3), J the point's derivative by the pixel.
+        :param width: of the tapes, metres.
+        """
+        turn, nearest = complex(math.cos(pose.yaw), math.sin(pose.yaw)), self._place.nearest
+        which, across = nearest.at(
+            turn * floor + complex(pose.x, pose.y), nearest.layers((colour,)))
+        normal = nearest.normal.take(which) * turn.conjugate()
+        x, y = normal.real, normal.imag
+        footprint = np.sqrt(
+            spread[:, 0] * x * x + 2.0 * spread[:, 1] * x * y + spread[:, 2] * y * y)
+        return np.abs(across) < half_strip(width, footprint)
 
     def _scorer(self, segments: tuple[FloorSegment, ...]) -> StripScorer:
         """Of the strips, which are most often those that were last asked about."""

@@ -88,7 +88,8 @@ class Quality:
     :ivar expected_px: what the noise measured in the image makes of it, px.
     :ivar explained: fraction of the predicted, visible line pixels that were found, 0 to 1.
     :ivar claimed: fraction of the line-like pixels in the image that the pose explains, 0 to 1;
-        NaN where nothing was looked for.
+        NaN where nothing was looked for. Line-like are the strips that a search finds; of a robot
+        that is followed, all pixels of the lines' colours.
     :ivar ambiguity: score of the second best pose over that of the best, 0 to 1.
     :ivar unobserved: directions that the lines in view do not fix, in words.
     """

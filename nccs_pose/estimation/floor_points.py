@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import cached_property
 import math
 
-from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.floor_table import as_complex, Complex, FloorTable
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.segment import Segmentation
 import numpy as np
@@ -106,6 +106,11 @@ class PixelFloor:
         spread = jacobian @ jacobian.transpose(0, 2, 1)
         spread *= pitch**2
         self._floor = np.column_stack([points, spread[:, 0], spread[:, 1, 1]])
+
+    def at(self, place: NDArray[np.intp]) -> tuple[Complex, Array]:
+        """The floor behind some pixels (P,): x + iy (P,), metres, and its spread (P, 3)."""
+        found = self._floor.take(place, axis=0)
+        return as_complex(found[:, :2]), found[:, 2:]
 
     def points(self, segmentation: Segmentation, width: float) -> FloorPoints:
         """What blobs of the view are on the floor, for tapes of a width in metres."""

@@ -19,12 +19,13 @@ from __future__ import annotations
 from collections.abc import Set
 
 from nccs_pose.estimation.aligner import Aligner
+from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.search import Searcher, Strips
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.verdict import contradiction, Objection
 from nccs_pose.geometry.lines import LineMap
@@ -82,17 +83,30 @@ class Follower:
         due = self._frames_since_check >= self._options.check_every
         if not (due or alignment.missing or len(alignment.lines) == 1):
             return Found(alignment, float('nan'), alignment.explained)
+        # What is refused here leaves the next image to be looked at as a whole as well.
+        masks = self._searcher.masks(image)
+        claimed = self._searcher.on_lines(alignment.pose, masks)
+        watch.lap('detect')
+        # No score exceeds 1.
+        if alignment.missing or min(claimed, alignment.explained) + _BETTER < 1.0:
+            against = self._better_elsewhere(alignment, self._searcher.strips(masks), watch)
+            if against is not None:
+                return Refused(against, alignment)
         self._frames_since_check = 0
-        segments = self._searcher.segments(image)
+        return Found(alignment, claimed, alignment.explained)
+
+    def _better_elsewhere(
+        self, alignment: Alignment, segments: Strips, watch: Stopwatch,
+    ) -> Objection | None:
+        """What the strips of the whole image say against a pose; None if nothing."""
         watch.lap('detect')
         against = contradiction(alignment, segments, self._map)
         if against is not None:
-            return Refused(against, alignment)
-        here, claimed = self._searcher.score(alignment.pose, segments)
-        # No score exceeds 1.
+            return against
+        here, _ = self._searcher.score(alignment.pose, segments)
         elsewhere = self._searcher.candidates(segments).fitted if here + _BETTER < 1.0 else ()
         watch.lap('associate')
         if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
                 elsewhere[0].pose, alignment.pose):
-            return Refused(Objection('another pose explains the image better'), alignment)
-        return Found(alignment, claimed, alignment.explained)
+            return Objection('another pose explains the image better')
+        return None

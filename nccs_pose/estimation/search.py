@@ -55,6 +55,7 @@ _STRAIGHT = 0.1
 _APART = 1.0
 
 Strips = tuple[FloorSegment, ...]
+Masks = dict[str, Mask]
 Colours = tuple[LineColour, ...]
 Look = Callable[[NDArray[np.uint8], Strips, Colours], tuple[Strips, Colours]]
 
@@ -89,27 +90,27 @@ class Searcher:
             (self._look_by_example, self._look_along),
             (self._look_along, self._look_along_by_example))
 
-    def segments(self, image: NDArray[np.uint8]) -> Strips:
-        """Straight strips of the map's colours on the floor, the largest first."""
-        return self._by_pixels(self.view(image))
+    def masks(self, image: NDArray[np.uint8]) -> Masks:
+        """Where the floor in an image (H, W, 3) has the map's colours, each by itself."""
+        return self._masks(self.view(image))
 
     def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """What of an image (H, W, 3) all looks take, (h, w, 3): its floor, made smaller."""
         return self._view.read(image)
 
-    def _by_pixels(self, part: NDArray[np.uint8]) -> Strips:
-        return self._strips({colour: self._mask(part, colour) for colour in self._widths})
+    def _masks(self, part: NDArray[np.uint8]) -> Masks:
+        return {colour: self._mask(part, colour) for colour in self._widths}
 
     def _first_look(
         self, part: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
-        return self._by_pixels(part), colours
+        return self.strips(self._masks(part)), colours
 
     def _look_along(
         self, part: NDArray[np.uint8], _: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look for what is no pixel's matter: lines, by all that they run over."""
-        return self._strips({
+        return self.strips({
             colour: self._faint(contrast_of(part, colour)) for colour in self._widths}), colours
 
     def _look_by_example(
@@ -147,7 +148,7 @@ class Searcher:
                 self._window))
         if all(seen is colour for seen, colour in zip(learned, colours)):
             return known, colours
-        return self._strips({
+        return self.strips({
             colour.name: unseen(part, colour.name) if seen is colour else mask_of(part, seen)
             for seen, colour in zip(learned, colours)}), tuple(learned)
 
@@ -162,7 +163,8 @@ class Searcher:
         return faint_line_mask(
             feature, self._view.region, self._options.noise_gate, self._window)
 
-    def _strips(self, masks: dict[str, Mask]) -> Strips:
+    def strips(self, masks: Masks) -> Strips:
+        """Straight strips of the map's colours on the floor, the largest first."""
         found: list[FloorSegment] = []
         for colour, mask in masks.items():
             blobs = self._view.blobs(mask, _PIXELS_PER_BLOB)
@@ -177,6 +179,14 @@ class Searcher:
     def taken_for(self, pose: Pose2, segments: Strips) -> list[FittedCandidate]:
         """What a pose may be taken for in a coarse image."""
         return self._associator.taken_for(pose, segments)
+
+    def on_lines(self, pose: Pose2, masks: Masks) -> float:
+        """Which part of the pixels that have the map's colours a pose has on its lines, 0 to 1."""
+        on = [self._associator.on_lines(
+            pose, *self._floor.at(self._view.inside(mask)), self._widths[colour], colour)
+            for colour, mask in masks.items()]
+        count = sum(len(part) for part in on)
+        return sum(int(np.count_nonzero(part)) for part in on) / count if count else 1.0
 
     def score(self, pose: Pose2, segments: Strips) -> tuple[float, float]:
         """How well a pose explains the strips, 0 to 1, and which part of them it explains."""

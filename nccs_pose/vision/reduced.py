@@ -64,6 +64,10 @@ class ReducedView:
             cv2.bitwise_and(mask, self.region), pixels_per_blob, pitch=self.pitch,
             origin=(self.columns.start, self.rows.start))
 
+    def inside(self, mask: Mask) -> NDArray[np.intp]:
+        """Which pixels of the view (P,), row by row, a mask (h, w) has where it shows floor."""
+        return np.flatnonzero(cv2.bitwise_and(mask, self.region))
+
     @property
     def pixels(self) -> Array:
         """The middles of the view's pixels, row by row (h * w, 2), in the image."""
