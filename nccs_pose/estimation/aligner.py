@@ -122,16 +122,10 @@ class Aligner:
         """
         pose = start
         if reach > LINEAR_PX:
-            # About as much is in view from where a search leads.
-            if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
-                return None
-            searched = self._measurer.search(image, start, prior, colours, reach)
+            searched = self._searched(image, start, prior, colours, reach, laid)
             if searched is None:
                 return None
-            pose = searched.pose
-            if laid is not None and (
-                    leaves_open(searched) or _near(pose, laid) or _near(pose, start)):
-                return None
+            pose = searched
         places = self._places(pose) if reach > 0.0 else self._places_near(pose)
         if len(places) < LEAST_STATIONS or places.length < _LEAST_LENGTH:
             return None
@@ -203,6 +197,21 @@ class Aligner:
     def _choose(self, column: int, row: int, turn: int) -> Places:
         metres, radians = _CHOSEN_APART
         return self._places(Pose2(metres * column, metres * row, radians * turn))
+
+    def _searched(
+        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        colours: tuple[LineColour, ...], reach: float, laid: Pose2 | None,
+    ) -> Pose2 | None:
+        """Where a search across the bands leads; None where to nothing, or to nothing new."""
+        # About as much is in view from where it leads.
+        if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
+            return None
+        searched = self._measurer.search(image, start, prior, colours, reach)
+        if searched is None or (laid is not None and (
+                leaves_open(searched) or _near(searched.pose, laid)
+                or _near(searched.pose, start))):
+            return None
+        return searched.pose
 
     def _begun(
         self, image: NDArray[np.uint8], places: Places, start: Pose2,
