@@ -692,6 +692,116 @@ def test_a_pose_that_explains_less_than_another_is_given_up() -> None:
         assert drive.right(drive.go(Pose2(0.02, 0.0, 0.0)))
 
 
+# ---------------------------------------------------------------- places that look the same
+
+
+CELLS = LineMap((*(_line((-8.0, y), (8.0, y)) for y in np.arange(-8.0, 8.5)),
+                 *(_line((x, -8.0), (x, 8.0)) for x in np.arange(-8.0, 8.5))))
+
+
+def _gap(drive: Drive, seconds: float) -> None:
+    """No image comes for some time."""
+    drive.stamp += round(1e9 * seconds) - PERIOD_NS
+
+
+@pytest.mark.parametrize(('line_map', 'start', 'step', 'gap', 'left'), [
+    # At 1 m/s through cells of 1 m, and at 90 deg/s in a square: it stops while nothing is seen.
+    (CELLS, Pose2(-2.2, 0.3, 0.2), Pose2(0.1, 0.0, 0.0), 1.0, Pose2(0.05, 0.0, 0.0)),
+    (CELLS, Pose2(-2.2, 0.3, 0.2), Pose2(0.1, 0.0, 0.0), 0.9, Pose2(0.41, 0.0, 0.0)),
+    (SQUARE, Pose2(0.02, 0.01, 0.0), Pose2(0.0, 0.0, math.pi / 20), 1.0, STILL)])
+def test_after_a_gap_a_place_that_looks_the_same_is_not_taken(
+        line_map: LineMap, start: Pose2, step: Pose2, gap: float, left: Pose2) -> None:
+    drive = Drive(replace(SCENE, line_map=line_map), start, wheels=False)
+    drive.localiser.set_prior(start, np.diag([0.1, 0.1, 0.1]) ** 2)
+    for _ in range(6):
+        assert drive.right(drive.go(step))
+    _gap(drive, gap)
+    for move in (left, STILL, STILL, STILL):
+        answer = drive.go(move)
+        assert answer.pose is None or drive.right(answer)
+        assert answer.state is State.AMBIGUOUS
+        assert any(_near(candidate.pose, drive.pose) for candidate in answer.candidates)
+
+
+@pytest.mark.parametrize('wheels', [True, False])
+def test_a_pose_that_was_given_does_not_stay_behind(wheels: bool) -> None:
+    """The robot drives on by a cell before any image shows where it is."""
+    drive = Drive(replace(SCENE, line_map=CELLS), Pose2(0.2, 0.3, 0.3), wheels=wheels)
+    drive.localiser.set_prior(drive.pose, np.diag([0.08, 0.08, 0.05]) ** 2)
+    for _ in range(11):
+        assert drive.go(Pose2(0.09, 0.0, 0.0), change=_black).pose is None
+    answers = [drive.go() for _ in range(3)]
+    if wheels:
+        assert all(drive.right(answer) for answer in answers)
+    else:
+        assert {answer.state for answer in answers} == {State.AMBIGUOUS}
+
+
+@pytest.mark.parametrize(('spacing', 'sigma', 'found'), [(0.5, 0.35, False), (2.0, 0.1, True)])
+def test_a_pose_that_was_given_decides_among_parallel_lines_if_it_can(
+        spacing: float, sigma: float, found: bool) -> None:
+    lanes = LineMap(tuple(_line((-30.0, y), (30.0, y)) for y in spacing * np.arange(-6, 7)))
+    drive = Drive(replace(SCENE, line_map=lanes), Pose2(1.0, 0.1, 0.05),
+                  LocaliserOptions(reach=3.0))
+    # One deviation off, and nearer to where the next line would be this one.
+    drive.localiser.set_prior(
+        drive.pose @ Pose2(0.1, sigma, 0.02), np.diag([sigma, sigma, 0.05]) ** 2)
+    for _ in range(3):
+        answer = drive.go(Pose2(0.02, 0.0, 0.0))
+        assert (answer.pose is not None) is found
+        if found:
+            assert abs(drive.error(answer)[1]) < 0.01
+
+
+def test_a_pose_that_images_refuted_decides_nothing_later() -> None:
+    """As the wheels' errors grow, the wrong one of two twins would be the first within them."""
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.05, 0.02, 0.0))
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    for _ in range(3):
+        assert drive.right(drive.go())
+    # Lifted and turned; the twin is 1.2 rad off what was expected, the true pose 1.94 rad.
+    drive.pose = Pose2(-0.05, 0.02, 1.94)
+    for _ in range(70):
+        answer = drive.go(Pose2(0.0, 0.0, 0.4))
+        assert answer.pose is None
+        assert answer.state in (State.AMBIGUOUS, State.LOST)
+
+
+def test_without_wheels_an_undecided_image_does_not_bind_a_robot_that_drives_on() -> None:
+    drive = Drive(SCENE, Pose2(0.0, -0.2, 2.0), wheels=False)
+    for _ in range(3):
+        assert drive.right(drive.go(Pose2(0.0, 0.0, 0.05)))
+    # Lifted; one image shows another place, then there is none for a while.
+    drive.pose = Pose2(-0.6, 0.3, -1.0)
+    assert drive.go().pose is None
+    for _ in range(12):
+        assert drive.go(change=_black).pose is None
+    answers = []
+    for _ in range(4):
+        answers.append(drive.go(Pose2(0.0, 0.0, 0.3)))
+        assert answers[-1].pose is None or drive.right(answers[-1])
+    assert [answer.state for answer in answers[1:]] == [State.TRACKING] * 3
+
+
+def test_poses_of_which_an_image_shows_no_strip_do_not_hold() -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7),
+                  LocaliserOptions(threshold='hsv'))
+    assert drive.go().state is State.AMBIGUOUS
+    for _ in range(3):
+        dark = drive.go(change=lambda image: (0.1 * image).astype(np.uint8))
+        assert dark.state is State.SEARCHING
+    assert drive.go().state is State.AMBIGUOUS
+
+
+def test_new_options_leave_no_image_unchecked() -> None:
+    drive = Drive(SCENE, Pose2(0.3, -0.2, 2.0))
+    for _ in range(2):
+        drive.go()
+    assert np.isnan(drive.go().quality.claimed)
+    drive.localiser.update_options(LocaliserOptions(stations=60))
+    assert drive.go().quality.claimed > 0.9
+
+
 @pytest.mark.parametrize('line', [
     Line(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), name='odd one'),
     Line(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), name='odd one'),

@@ -86,7 +86,8 @@ class PaperLocaliser:
         assert self._last is not None
         stamp, pose = self._last
         before, now = self._odometry.at(stamp), self._odometry.at(stamp_ns)
-        return pose if before is None or now is None else pose @ before.inverse() @ now
+        return pose if before is None or now is None else (
+            pose @ before.pose.inverse() @ now.pose)
 
     def _line_pixels(self, image: Image, pose: Pose2) -> tuple[Array, NDArray[np.intp]]:
         """Pixels (N, 2) of the blobs that lie on lines, and which line (N,)."""

@@ -89,5 +89,5 @@ class Admission:
         before, after = self._odometry.at(before_ns), self._odometry.at(after_ns)
         if before is None or after is None:
             return False
-        step = before.inverse() @ after
+        step = before.pose.inverse() @ after.pose
         return bool(np.hypot(step.x, step.y) > _MOVED or abs(step.yaw) > _MOVED)

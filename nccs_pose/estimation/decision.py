@@ -33,13 +33,13 @@ _CARRIED = 8
 
 
 def the_one_expected(
-    held: Sequence[Found], left: Sequence[Candidate], told: Told | None,
+    held: Sequence[Found], sifted: Sifted, told: Told | None,
     prediction: Prediction | None, options: LocaliserOptions,
 ) -> Found | None:
     """The one pose that a prior or a prediction expects, if it is one of the best of all.
 
     :param held: the poses that explain the image, best first.
-    :param left: poses that may explain it as well, but were not laid on it.
+    :param sifted: what else the search of it left.
     :param told: where the prediction, or without one a prior, says that the robot is.
     """
     if told is None:
@@ -47,7 +47,8 @@ def the_one_expected(
     near = [f for f in held if (
         told.holds(f.alignment.pose, f.alignment.covariance) if prediction is None
         else is_expected(f.alignment, prediction, options.innovation_gate))]
-    if not near or any(told.holds(c.pose) for c in left):
+    if not near or any(told.holds(c.pose) for c in sifted.open) or told.holds_guesses(
+            sifted.others.place, sifted.others.rotation).any():
         return None
     best, ratio = near[0], options.ambiguity_ratio
     if best.score < ratio * held[0].score or any(

@@ -19,22 +19,17 @@ from __future__ import annotations
 from collections.abc import Set
 
 from nccs_pose.estimation.aligner import Aligner
-from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.elsewhere import Elsewhere
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
-from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.search import Searcher, Strips
+from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.stopwatch import Stopwatch
-from nccs_pose.estimation.verdict import contradiction, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
-
-# A pose elsewhere must beat the tracked one by this much to unseat it.
-_BETTER = 0.15
 
 
 class Follower:
@@ -47,9 +42,10 @@ class Follower:
         self._aligner = aligner
         self._searcher = searcher
         self._judge = judge
-        self._map = line_map
+        self._elsewhere = Elsewhere(aligner, searcher, line_map, options)
         self._options = options
-        self.begin()
+        # Whatever was followed before has not been held against a whole image by these.
+        self._frames_since_check = options.check_every
 
     def begin(self) -> None:
         """Start anew, with a pose that the whole image has shown."""
@@ -81,32 +77,18 @@ class Follower:
             return refused
         self._frames_since_check += 1
         due = self._frames_since_check >= self._options.check_every
-        if not (due or alignment.missing or len(alignment.lines) == 1):
+        if not (due or prediction.is_vague or alignment.missing or len(alignment.lines) == 1):
             return Found(alignment, float('nan'), alignment.explained)
-        # What is refused here leaves the next image to be looked at as a whole as well.
         masks = self._searcher.masks(image)
         claimed = self._searcher.on_lines(alignment.pose, masks)
         watch.lap('detect')
-        # No score exceeds 1.
-        if alignment.missing or min(claimed, alignment.explained) + _BETTER < 1.0:
-            against = self._better_elsewhere(alignment, self._searcher.strips(masks), watch)
-            if against is not None:
-                return Refused(against, alignment)
+        if prediction.is_vague or self._elsewhere.leaves_room(alignment, claimed):
+            segments = self._searcher.strips(masks)
+            watch.lap('detect')
+            elsewhere = self._elsewhere.refused(image, alignment, prediction, segments)
+            watch.lap('associate')
+            if elsewhere is not None:
+                # The next image is looked at as a whole as well.
+                return elsewhere
         self._frames_since_check = 0
         return Found(alignment, claimed, alignment.explained)
-
-    def _better_elsewhere(
-        self, alignment: Alignment, segments: Strips, watch: Stopwatch,
-    ) -> Objection | None:
-        """What the strips of the whole image say against a pose; None if nothing."""
-        watch.lap('detect')
-        against = contradiction(alignment, segments, self._map)
-        if against is not None:
-            return against
-        here, _ = self._searcher.score(alignment.pose, segments)
-        elsewhere = self._searcher.candidates(segments).fitted if here + _BETTER < 1.0 else ()
-        watch.lap('associate')
-        if elsewhere and elsewhere[0].score > here + _BETTER and not same_pose(
-                elsewhere[0].pose, alignment.pose):
-            return Objection('another pose explains the image better')
-        return None

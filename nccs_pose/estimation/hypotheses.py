@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.motion import SPEED, Wheels
 from nccs_pose.geometry.pose import Pose2
 
 # Images that a hypothesis must have explained before it is chosen among several.
@@ -37,10 +38,12 @@ class Hypothesis:
 
     :ivar pose: T_map_base at the last image that was looked at.
     :ivar scores: its score in each image that it explained, 0 to 1.
+    :ivar apart: how far the robot may have gone since, unseen by any wheels, metres and rad.
     """
 
     pose: Pose2
     scores: tuple[float, ...]
+    apart: tuple[float, float] = (0.0, 0.0)
 
     @property
     def mean(self) -> float:
@@ -49,12 +52,18 @@ class Hypothesis:
 
 
 def carried(
-    hypotheses: Sequence[Hypothesis], before: Pose2 | None, now: Pose2 | None,
+    hypotheses: Sequence[Hypothesis], before: Wheels | None, now: Wheels | None, seconds: float,
 ) -> tuple[Hypothesis, ...]:
-    """Move hypotheses on by what the wheels did, T_odom_base then and now; else leave them."""
+    """Move hypotheses on by what the wheels did; without wheels they are somewhere near.
+
+    :param before: what these said when they were; ``now`` what they say at present.
+    :param seconds: from then till now.
+    """
     if before is None or now is None:
-        return tuple(hypotheses)
-    step = before.inverse() @ now
+        way, turn = (speed * seconds for speed in SPEED)
+        return tuple(
+            replace(h, apart=(h.apart[0] + way, h.apart[1] + turn)) for h in hypotheses)
+    step = before.pose.inverse() @ now.pose
     return tuple(replace(h, pose=h.pose @ step) for h in hypotheses)
 
 
@@ -70,8 +79,10 @@ def confronted(
         return tuple(hypotheses)
     found = []
     for pose, score in held:
-        scores = next((h.scores for h in hypotheses if same_pose(h.pose, pose)), ())
-        found.append(Hypothesis(pose, (*scores, score)))
+        before = max(
+            (h for h in hypotheses if same_pose(h.pose, pose, h.apart)),
+            key=lambda h: h.mean, default=None)
+        found.append(Hypothesis(pose, (*(before.scores if before is not None else ()), score)))
     return tuple(sorted(found, key=lambda h: -h.mean))
 
 

@@ -65,6 +65,7 @@ _NEARLY_ALL = 0.85
 # A pose on fewer than three lines, or a bad fit, has to be where it is expected, within so many
 # deviations.
 _WEAK_GATE = 3.0
+_NOTHING = Objection('no line-like strip in the image lies on any of its lines')
 _UNFIXED = Objection('the lines that it rests on do not fix a pose')
 
 
@@ -174,6 +175,8 @@ class Judge:
         if against is not None:
             return against
         found = self.measured(alignment, segments, strips)
+        if found.score <= 0.0:
+            return _NOTHING
         used = lines_used(alignment)
         weaker, stronger = sorted((found.claimed, alignment.explained))
         if alignment.missing and len(segments) < _LEAST_STRIPS:

@@ -41,18 +41,12 @@ from nccs_pose.estimation.estimate import (
 )
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
+from nccs_pose.estimation.given_pose import GivenPose
 from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
-from nccs_pose.estimation.motion import (
-    by_odometry,
-    by_velocity,
-    Odometry,
-    PAST,
-    Prediction,
-    Track,
-)
+from nccs_pose.estimation.motion import carried_on, Odometry, PAST, Prediction, Track, Wheels
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.rivals import Rivals
@@ -133,17 +127,18 @@ class Localiser:
         """
         self._track: Track | None = None
         self._past: tuple[Track, ...] = ()
-        self._prior: tuple[Pose2, Array] | None = None
+        self._given: GivenPose | None = None
         self._ever_tracked = False
         self._follower.begin()
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
-        # Where the wheels say that the robot was at the image in hand (T_odom_base).
-        self._now: Pose2 | None = None
-        # Poses among which no image has decided yet, and where the wheels were then.
+        # What the wheels say at the image in hand.
+        self._now: Wheels | None = None
+        # Poses among which no image has decided yet, and when, and what the wheels said then.
         self._open: tuple[Hypothesis, ...] = ()
-        self._open_odometry: Pose2 | None = None
+        self._open_ns = 0
+        self._open_odometry: Wheels | None = None
         self._doubts: frozenset[int] = frozenset()
         # Lines that the poses since the last search rest on.
         self._shown: frozenset[int] = frozenset()
@@ -161,7 +156,7 @@ class Localiser:
         :param covariance: of (x, y, yaw) (3, 3), positive definite.
         """
         self.relocalise()
-        self._prior = (pose, np.array(covariance, dtype=float))
+        self._given = GivenPose(pose, np.array(covariance, dtype=float))
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
         """Take a sample of wheel odometry, T_odom_base.
@@ -172,6 +167,8 @@ class Localiser:
             self._odometry.add(stamp_ns, pose)
         except FrameRefusedError:
             self._open_odometry = None
+            if self._given is not None:
+                self._given.forget_odometry()
             if self._track is not None:
                 self._track = replace(self._track, odometry=None)
             raise
@@ -188,31 +185,27 @@ class Localiser:
             self.relocalise()
         watch = Stopwatch()
         self._now = self._odometry.at(stamp_ns)
-        prediction = self._predict(stamp_ns)
+        prediction = None if self._track is None else carried_on(
+            self._past, self._track, self._now, stamp_ns)
         watch.lap('predict')
-        if prediction is None:
-            return self._search(stamp_ns, image, None, Refused(), watch)
+        # While poses are open, what agrees with the one that was expected is one of them.
+        if prediction is None or self._open:
+            return self._search(stamp_ns, image, prediction, Refused(), watch)
         followed = self._follower.follow(image, prediction, self._colours, self._doubts, watch)
         if isinstance(followed, Found):
             return self._tracking(
                 stamp_ns, followed, prediction, watch, 'the pose explains the image')
         return self._search(stamp_ns, image, prediction, followed, watch)
 
-    def _predict(self, stamp_ns: int) -> Prediction | None:
-        track = self._track
-        if track is None:
-            return None
-        if track.odometry is not None and self._now is not None:
-            return by_odometry(track.pose, track.covariance, track.odometry, self._now)
-        return by_velocity(self._past, track, stamp_ns)
-
     def _search(
         self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
         refused: Refused, watch: Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
-        hypotheses = carried(self._open, self._open_odometry, self._now)
-        told = self._told(prediction)
+        hypotheses = carried(
+            self._open, self._open_odometry, self._now, 1e-9 * (stamp_ns - self._open_ns))
+        given = None if self._given is None else self._given.expected(stamp_ns, self._now)
+        told = self._told(given, prediction)
         looks: dict[Sight, Sifted] = {}
         for sight in sights(
                 image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
@@ -235,14 +228,15 @@ class Localiser:
             held = [f for f in held if f.score > here or same_pose(
                 f.alignment.pose, refused.alignment.pose)]
         if not held:
-            trusted = self._trusted(image, segments, watch)
+            trusted = None if given is None else self._trusted(image, given, segments, watch)
             if trusted is not None:
                 return self._tracking(
-                    stamp_ns, *trusted, watch, 'the image agrees with the pose that was given')
+                    stamp_ns, trusted, given, watch,
+                    'the image agrees with the pose that was given')
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = the_one_expected(held, sifted.open, told, prediction, self.options)
+        chosen = the_one_expected(held, sifted, told, prediction, self.options)
         if chosen is not None:
             words = 'found by searching the whole image'
             if len(held) > 1:
@@ -250,32 +244,36 @@ class Localiser:
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
         self._open, more = left_open(hypotheses, held, sifted)
-        self._open_odometry = self._now
+        self._open_ns, self._open_odometry = stamp_ns, self._now
         best = self._open[0]
         if ambiguity(self._open) <= self.options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
+        if hypotheses and told is not None and not any(
+                told.holds(pose) for pose in (
+                    *(f.alignment.pose for f in held), *(c.pose for c in sifted.open))):
+            # For the second time none of them is where it was expected. Carried on, that would
+            # sooner or later agree with one of them by chance.
+            self._track, self._past, self._given = None, (), None
         return self._undecided(stamp_ns, held, more, watch)
 
     def _trusted(
-        self, image: NDArray[np.uint8], segments: tuple[FloorSegment, ...], watch: Stopwatch,
-    ) -> tuple[Found, Prediction] | None:
+        self, image: NDArray[np.uint8], given: Prediction, segments: tuple[FloorSegment, ...],
+        watch: Stopwatch,
+    ) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""
-        if self._prior is None:
-            return None
-        given = Prediction(*self._prior, by_odometry=False)
         followed = self._follower.follow(image, given, self._colours, self._doubts, watch)
         if not isinstance(followed, Found):
             return None
         _, claimed = self._searcher.score(followed.alignment.pose, segments)
-        return (replace(followed, claimed=claimed), given) if claimed >= _CLAIMED else None
+        return replace(followed, claimed=claimed) if claimed >= _CLAIMED else None
 
-    def _told(self, prediction: Prediction | None) -> Told | None:
-        """Where a prior or the prediction says that the robot is."""
-        if self._prior is not None:
-            return Told(*self._prior, _PRIOR_GATE)
+    def _told(self, given: Prediction | None, prediction: Prediction | None) -> Told | None:
+        """Where a pose that was given or the prediction says that the robot is."""
+        if given is not None:
+            return Told(given.pose, given.carried, _PRIOR_GATE)
         if prediction is not None:
             return Told(prediction.pose, prediction.covariance, self.options.innovation_gate)
         return None
@@ -303,7 +301,7 @@ class Localiser:
         self._track = Track(
             stamp_ns, alignment.pose, covariance, self._now, seen_ns)
         self._colours = alignment.colours
-        self._prior = None
+        self._given = None
         self._open, self._open_odometry = (), None
         self._doubts = settled_doubts(self._doubts, alignment)
         shown = lines_shown(alignment)

@@ -60,10 +60,13 @@ class Poses:
         return list(map(Pose2, place.real.tolist(), place.imag.tolist(), yaw.tolist()))
 
 
-def same_pose(a: Pose2, b: Pose2) -> bool:
-    """Whether two poses are close enough to converge to one."""
-    return (math.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE
-            and abs(math.remainder(a.yaw - b.yaw, 2.0 * math.pi)) < SAME_YAW)
+def same_pose(a: Pose2, b: Pose2, apart: tuple[float, float] = (0.0, 0.0)) -> bool:
+    """Whether two poses are close enough to converge to one.
+
+    :param apart: by which one may have moved from the other besides, metres and rad.
+    """
+    return (math.hypot(a.x - b.x, a.y - b.y) < _SAME_PLACE + apart[0]
+            and abs(math.remainder(a.yaw - b.yaw, 2.0 * math.pi)) < SAME_YAW + apart[1])
 
 
 def unlike(poses: Poses, known: Poses) -> NDArray[np.bool_]:

@@ -33,6 +33,9 @@ _LONGEST_GAP_NS = 250_000_000
 # Without odometry a velocity is believed for so long, s.
 _LONGEST_COAST = 1.0
 _KEPT = 4000
+# So many samples in a row before the last one say that this was stamped ahead of its time; fewer
+# came late.
+_DISORDERED = 3
 # Wheels roll and turn no faster, m/s and rad/s, for no longer than this without a word, s. What
 # goes this much further, m and rad, from one sample to the next is another start of odometry;
 # less may be the stamps'.
@@ -46,10 +49,30 @@ _FLOOR_SIGMA = (0.02, 0.015)
 _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
 # Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
-_SPEED = (1.0, 2.0)
+SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
+# A prediction less sure than this, m and rad, may leave room for more than one place that looks
+# the same.
+_SURE = (0.05, 0.1)
 # So many poses before the last one show how the velocity changes.
 PAST = 3
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """What wheels say at some moment.
+
+    :ivar pose: T_odom_base.
+    :ivar way: how far they have rolled since odometry began, metres, to and fro.
+    :ivar turn: how much they have turned the robot since, rad, to and fro.
+    :ivar unheard: what an acceleration of 1 m/s^2 or rad/s^2 may add, as they were not heard just
+        then, metres or rad: much in a gap between two samples and past the last one.
+    """
+
+    pose: Pose2
+    way: float = 0.0
+    turn: float = 0.0
+    unheard: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +82,14 @@ class Track:
     :ivar stamp_ns: of the image.
     :ivar pose: T_map_base.
     :ivar covariance: of (x, y, yaw) (3, 3).
-    :ivar odometry: T_odom_base then; None without odometry.
+    :ivar odometry: what the wheels said then; None without odometry.
     :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
     """
 
     stamp_ns: int
     pose: Pose2
     covariance: Array
-    odometry: Pose2 | None
+    odometry: Wheels | None
     seen_ns: int
 
 
@@ -92,6 +115,13 @@ class Prediction:
     def information(self) -> Array:
         """The inverse of :attr:`covariance`."""
         return inverse(self.covariance)
+
+    @property
+    def is_vague(self) -> bool:
+        """Whether an image that agrees with it may show another place that looks the same."""
+        (xx, xy, _), (_, yy, _), (_, _, tt) = self.carried.tolist()
+        longest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
+        return longest > _SURE[0] ** 2 or tt > _SURE[1] ** 2
 
     def without_floor(self, covariance: Array, solved: Array) -> Array:
         """A covariance (3, 3) after the image, with what the floor brought in taken out again.
@@ -122,33 +152,53 @@ class Odometry:
         self._clock_jump = clock_jump
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
+        # Ways and turns up to each of them.
+        self._rolled: list[tuple[float, float]] = []
+        self._late = 0
 
     def add(self, stamp_ns: int, pose: Pose2) -> None:
-        """Take one sample; one that is not newer than the last is no news.
+        """Take one sample; one that is not newer than the last is no news, but for several.
 
         :raises FrameRefusedError: `odom_jump`, if the sample does not follow on the last: all
             before it is forgotten, and it is the first.
         """
+        if self._is_late(stamp_ns):
+            return
         jump = self._jump(stamp_ns, pose)
         if jump:
             self.clear()
-        elif self._stamps and stamp_ns <= self._stamps[-1]:
-            return
+        way = turn = 0.0
+        if self._stamps:
+            step, turned = _apart(self._poses[-1], pose)
+            way, turn = self._rolled[-1][0] + step, self._rolled[-1][1] + turned
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
+        self._rolled.append((way, turn))
         if len(self._stamps) > 2 * _KEPT:
-            del self._stamps[:_KEPT], self._poses[:_KEPT]
+            del self._stamps[:_KEPT], self._poses[:_KEPT], self._rolled[:_KEPT]
         if jump:
             raise FrameRefusedError('odom_jump', f'odom: {jump}; odometry begins anew')
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Whether a sample is no news; what is ahead of several in a row is forgotten."""
+        ahead = self._stamps[-1] - stamp_ns if self._stamps else -1
+        if 0 <= ahead <= 1e9 * self._clock_jump:
+            self._late += ahead > 0
+            if self._late < _DISORDERED:
+                return True
+            begin = bisect_right(self._stamps, stamp_ns)
+            del self._stamps[begin:], self._poses[begin:], self._rolled[begin:]
+        self._late = 0
+        return False
 
     def _jump(self, stamp_ns: int, pose: Pose2) -> str:
         """How a sample does not follow on the last; empty if it does."""
         if not self._stamps:
             return ''
-        last, seconds = self._poses[-1], 1e-9 * (stamp_ns - self._stamps[-1])
+        seconds = 1e-9 * (stamp_ns - self._stamps[-1])
         if seconds < -self._clock_jump:
             return f'the stamps jumped back by {-seconds:.3f} s'
-        way, turn = math.hypot(pose.x - last.x, pose.y - last.y), abs(wrapped(pose.yaw - last.yaw))
+        way, turn = _apart(self._poses[-1], pose)
         time = min(seconds, _LONGEST_ROLL)
         if seconds > 0.0 and (
                 way > _LEAP[0] + _FASTEST[0] * time or turn > _LEAP[1] + _FASTEST[1] * time):
@@ -159,32 +209,62 @@ class Odometry:
         """Forget everything, as after a jump of the clock."""
         self._stamps.clear()
         self._poses.clear()
+        self._rolled.clear()
+        self._late = 0
 
-    def at(self, stamp_ns: int) -> Pose2 | None:
-        """T_odom_base at a stamp; carried on a little past the last sample, else None."""
+    def at(self, stamp_ns: int) -> Wheels | None:
+        """What the wheels say at a stamp; carried on a little past the last sample, else None."""
         n = len(self._stamps)
         if n < 2 or stamp_ns < self._stamps[0] - 1:
             return None
         right = min(max(bisect_right(self._stamps, stamp_ns), 1), n - 1)
         left = right - 1
         t0, t1 = self._stamps[left], self._stamps[right]
-        beyond = stamp_ns - t1
-        if beyond > _LONGEST_GAP_NS or t1 - t0 > 4 * _LONGEST_GAP_NS:
+        since, until = stamp_ns - t0, t1 - stamp_ns
+        if -until > _LONGEST_GAP_NS or t1 - t0 > 4 * _LONGEST_GAP_NS:
             return None
-        share = (stamp_ns - t0) / (t1 - t0)
+        share = since / (t1 - t0)
         a, b = self._poses[left], self._poses[right]
-        return Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y),
-                     a.yaw + share * wrapped(b.yaw - a.yaw))
+        way, turn = (u + share * (v - u) for u, v in zip(
+            self._rolled[left], self._rolled[right]))
+        return Wheels(
+            Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y),
+                  a.yaw + share * wrapped(b.yaw - a.yaw)),
+            # By so much a parabola leaves the straight line through two of its points.
+            way, turn, 0.5e-18 * abs(since * until))
 
 
-def by_odometry(pose: Pose2, covariance: Array, before: Pose2, after: Pose2) -> Prediction:
-    """Carry a pose and its covariance on by what the wheels did between two stamps."""
-    step = before.inverse() @ after
+def _apart(a: Pose2, b: Pose2) -> tuple[float, float]:
+    """How far apart two poses are, metres and rad."""
+    return math.hypot(b.x - a.x, b.y - a.y), abs(wrapped(b.yaw - a.yaw))
+
+
+def carried_on(
+    past: Sequence[Track], last: Track, now: Wheels | None, stamp_ns: int,
+) -> Prediction | None:
+    """Carry a pose on to a stamp by the wheels, or where they are silent by its velocity.
+
+    :param past: the poses before the last one, in order.
+    :param now: what the wheels say at the stamp; None without odometry.
+    """
+    if last.odometry is not None and now is not None:
+        return by_odometry(last.pose, last.covariance, last.odometry, now)
+    return by_velocity(past, last, stamp_ns)
+
+
+def by_odometry(pose: Pose2, covariance: Array, before: Wheels, after: Wheels) -> Prediction:
+    """Carry a pose and its covariance on by what the wheels did between two moments.
+
+    They err by the whole of their way, also where it leads back.
+    """
+    step = before.pose.inverse() @ after.pose
     moved = pose @ step
-    distance, angle = math.hypot(step.x, step.y), abs(step.yaw)
-    sigma = _PER_METRE[0] * math.sqrt(distance)
+    distance = max(math.hypot(step.x, step.y), after.way - before.way)
+    angle = max(abs(step.yaw), after.turn - before.turn)
+    faster, faster_yaw = (a * after.unheard for a in _ACCELERATION)
+    sigma = math.hypot(_PER_METRE[0] * math.sqrt(distance), faster)
     sigma_yaw = math.hypot(
-        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle))
+        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw)
     return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
 
 
@@ -200,7 +280,7 @@ def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction
     if not 0.0 < dt <= blind <= _LONGEST_COAST:
         return None
     if not past:
-        sigma, sigma_yaw = (speed * blind for speed in _SPEED)
+        sigma, sigma_yaw = (speed * blind for speed in SPEED)
         return Prediction(last.pose, _carried(
             last.pose, last.covariance, last.pose, sigma, sigma_yaw), False)
     tracks = (*past[-PAST:], last)

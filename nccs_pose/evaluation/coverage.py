@@ -37,7 +37,7 @@ import zlib
 
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.estimation.motion import by_odometry
+from nccs_pose.estimation.motion import by_odometry, Wheels
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
 from nccs_pose.evaluation.tables import table
@@ -232,7 +232,7 @@ def _second_image(
     told = pose @ Pose2(*_MOTION)
     # What is expected goes by the step that wheels tell, so it is the true one that is drawn: if
     # they erred from a true step, those that tell too little would be thought too exact.
-    expected = by_odometry(pose, np.zeros((3, 3)), pose, told)
+    expected = by_odometry(pose, np.zeros((3, 3)), Wheels(pose), Wheels(told))
     there = Pose2.from_array(rng.multivariate_normal(told.as_array(), expected.carried))
     localiser.add_odometry(-_FRAME_NS, pose)
     localiser.add_odometry(0, pose)

@@ -1,0 +1,136 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether an image that agrees with an expected pose shows another place as well, or better."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+from nccs_pose.estimation.aligner import Aligner
+from nccs_pose.estimation.alignment import Alignment, leaves_open
+from nccs_pose.estimation.association import Candidates
+from nccs_pose.estimation.ledger import Refused
+from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
+from nccs_pose.estimation.motion import Prediction
+from nccs_pose.estimation.observability import COINCIDENT
+from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.search import Searcher, Strips
+from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.verdict import contradiction, Objection
+from nccs_pose.geometry.lines import LineMap
+from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
+from numpy.typing import NDArray
+
+# A pose elsewhere must beat the tracked one by this much to unseat it.
+_BETTER = 0.15
+# Lines across which a pose is laid on the next parallel one are so far apart at least, metres; of
+# those that a prediction leaves open so many are tried, the nearest first.
+_APART = 0.1
+_TRIED = 4
+_ANOTHER = Objection('another pose explains the image better')
+_AS_WELL = Objection('another place where the robot may be by now explains the image as well')
+
+
+class Elsewhere:
+    """Looks for other places, on one map, that an image shows."""
+
+    def __init__(
+        self, aligner: Aligner, searcher: Searcher, line_map: LineMap, options: LocaliserOptions,
+    ) -> None:
+        self._aligner = aligner
+        self._searcher = searcher
+        self._map = line_map
+        self._options = options
+
+    def leaves_room(self, alignment: Alignment, claimed: float) -> bool:
+        """Whether a pose leaves so much unexplained that another could explain more.
+
+        :param claimed: fraction of the line-coloured pixels that lie on its lines.
+        """
+        # No score exceeds 1.
+        return bool(alignment.missing) or min(claimed, alignment.explained) + _BETTER < 1.0
+
+    def refused(
+        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction,
+        segments: Strips,
+    ) -> Refused | None:
+        """What the whole image says against a pose that was laid on it; None if nothing.
+
+        A prediction that is sure decides between places that look the same; where it is vague
+        there may be several of them where the robot can be.
+
+        :param image: (H, W, 3) uint8 BGR.
+        :param segments: the strips in it.
+        """
+        against = contradiction(alignment, segments, self._map)
+        if against is not None:
+            return Refused(against, alignment)
+        vague = prediction.is_vague
+        here, _ = self._searcher.score(alignment.pose, segments)
+        if not vague and here + _BETTER >= 1.0:
+            return None
+        told = Told(prediction.pose, prediction.covariance, self._options.innovation_gate)
+        found = self._searcher.candidates(segments, told if vague else None)
+        best = found.fitted[0] if found.fitted else None
+        if best is not None and best.score > here + _BETTER and not same_pose(
+                best.pose, alignment.pose):
+            return Refused(_ANOTHER, alignment)
+        if vague and (self._shows_as_much(found, alignment, here, told)
+                      or self._is_one_of_parallels(image, alignment, prediction, told)):
+            # It is no worse than the others.
+            return Refused(_AS_WELL)
+        return None
+
+    def _shows_as_much(
+        self, found: Candidates, alignment: Alignment, here: float, told: Told,
+    ) -> bool:
+        """Whether strips show as much of another pose where it is told."""
+        least = self._options.ambiguity_ratio * here
+        others = found.others[unlike(found.others, Poses.of([alignment.pose]))]
+        return bool(told.holds_guesses(others.place, others.rotation).any()) or any(
+            c.score >= least and told.holds(c.pose) and not same_pose(c.pose, alignment.pose)
+            for c in found.fitted)
+
+    def _is_one_of_parallels(
+        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction, told: Told,
+    ) -> bool:
+        """Whether a pose on parallel lines alone lies as well on others where it is told.
+
+        These fix no pose, so that no search of the whole image finds them.
+        """
+        if not leaves_open(alignment.refinement):
+            return False
+        least = self._options.ambiguity_ratio * alignment.explained
+        places = (Pose2(alignment.pose.x + x, alignment.pose.y + y, alignment.pose.yaw)
+                  for x, y in self._steps_across(alignment.lines[0]).tolist())
+        for pose in islice(filter(told.holds, places), _TRIED):
+            other = self._aligner.align(
+                image, pose, alignment.colours, reach=self._options.band,
+                prior=(pose, prediction.information))
+            if other is not None and other.explained >= least:
+                return True
+        return False
+
+    def _steps_across(self, line: int) -> Array:
+        """What lays a map's lines on parallel ones of their colour (K, 2), metres, least first."""
+        x, y, _ = self._map.directions.T
+        normal = np.array([-y[line], x[line]])
+        parallel = np.abs(x * y[line] - y * x[line]) < COINCIDENT
+        parallel &= np.array([other.colour == self._map[line].colour for other in self._map])
+        across = self._map.starts[parallel, :2] @ normal
+        steps = np.unique(np.round((across[:, None] - across) / _APART)) * _APART
+        steps = steps[steps != 0.0]
+        return steps[np.argsort(np.abs(steps)), None] * normal
