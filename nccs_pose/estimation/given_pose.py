@@ -36,7 +36,7 @@ class GivenPose:
         :param pose: T_map_base.
         :param covariance: of (x, y, yaw) (3, 3).
         """
-        self._told = Prediction(pose, covariance, by_odometry=False)
+        self._told = Prediction(pose, covariance, by_odometry=False, is_given=True)
         self._track: Track | None = None
 
     def expected(self, stamp_ns: int, odometry: Wheels | None) -> Prediction | None:
@@ -49,7 +49,8 @@ class GivenPose:
                 stamp_ns, self._told.pose, self._told.carried, odometry, stamp_ns)
         if self._track.stamp_ns == stamp_ns:
             return self._told
-        return carried_on((), self._track, odometry, stamp_ns)
+        expected = carried_on((), self._track, odometry, stamp_ns)
+        return None if expected is None else replace(expected, is_given=True)
 
     def forget_odometry(self) -> None:
         """No step of the wheels leads on from what they told until now."""

@@ -51,9 +51,9 @@ _YAW_PER_RADIAN = 0.05
 # Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
-# A prediction less sure than this, m and rad, may leave room for more than one place that looks
-# the same.
-_SURE = (0.05, 0.1)
+# A prediction less sure than this, m and rad, leaves room for more than one place that looks the
+# same: of cells of half a metre it may be halfway to the next after 2.5 deviations.
+_SURE = (0.1, 0.2)
 # So many poses before the last one show how the velocity changes.
 PAST = 3
 
@@ -100,11 +100,13 @@ class Prediction:
     :ivar pose: T_map_base.
     :ivar carried: covariance of (x, y, yaw) (3, 3), by what moved it.
     :ivar by_odometry: whether wheels say so, or only the last velocity.
+    :ivar is_given: whether it goes back to what somebody said, and not to an image.
     """
 
     pose: Pose2
     carried: Array
     by_odometry: bool
+    is_given: bool = False
 
     @cached_property
     def covariance(self) -> Array:
@@ -121,7 +123,7 @@ class Prediction:
         """Whether an image that agrees with it may show another place that looks the same."""
         (xx, xy, _), (_, yy, _), (_, _, tt) = self.carried.tolist()
         longest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
-        return longest > _SURE[0] ** 2 or tt > _SURE[1] ** 2
+        return self.is_given or longest > _SURE[0] ** 2 or tt > _SURE[1] ** 2
 
     def without_floor(self, covariance: Array, solved: Array) -> Array:
         """A covariance (3, 3) after the image, with what the floor brought in taken out again.
