@@ -833,6 +833,19 @@ def _along_the_rails(seed: int, frames: int) -> tuple[Drive, list[Estimate]]:
     return drive, answers
 
 
+@pytest.mark.parametrize('slip', [-0.02, 0.02])
+def test_wheels_of_another_size_are_reckoned_with_along_the_rails(slip: float) -> None:
+    drive = Drive(replace(SCENE, line_map=RAILS), Pose2(-1.5, 0.0, 0.0),
+                  LocaliserOptions(reach=3.0))
+    drive.go()
+    for _ in range(80):
+        answer = drive.go(Pose2(0.25, 0.0, 0.0), Pose2(0.25 * slip, 0.0, 0.0))
+    error, covariance = drive.error(answer), answer.covariance
+    assert covariance is not None
+    assert abs(error[0]) > 0.3
+    assert abs(error[0]) < 2.0 * math.sqrt(covariance[0, 0])
+
+
 def test_parallel_lines_leave_one_direction_named_and_truly_uncertain() -> None:
     squares = []
     for seed in range(6):

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 from hypothesis import given
 from hypothesis import strategies as st
 from nccs_pose.estimation.motion import (
@@ -136,9 +138,25 @@ def test_wheels_err_by_all_of_their_way() -> None:
         assert begun is not None and ended is not None
         carried = by_odometry(START, np.zeros((3, 3)), begun, ended).carried
         sigmas.append(np.sqrt(np.diag(carried)))
-    assert sigmas[0] == pytest.approx([0.03, 0.03, 0.03], rel=1e-3)
+    # 3 cm by chance, 2 cm by the wheels' size.
+    place = np.hypot(0.03, 0.02)
+    assert sigmas[0] == pytest.approx([place, place, 0.03], rel=1e-3)
     assert sigmas[1] == pytest.approx(
-        [0.03, 0.03, np.hypot(0.03, 0.05 * np.sqrt(2.0 * np.pi))], rel=1e-3)
+        [place, place, np.hypot(0.03, 0.05 * np.sqrt(2.0 * np.pi))], rel=1e-3)
+
+
+def test_wheels_that_are_taken_for_smaller_than_they_are_err_in_proportion() -> None:
+    """However many images in between fix nothing of what they do."""
+    zero, steps = np.zeros((3, 3)), np.linspace(0.0, 10.0, 41)
+    wheels = [Wheels(Pose2(x, 0.0, 0.0), 3.0 + x) for x in steps]
+    pose, covariance = START, zero
+    for before, after in itertools.pairwise(wheels):
+        prediction = by_odometry(pose, covariance, before, after, 3.0)
+        # Its yaw is known all the way.
+        pose, covariance = prediction.pose, np.diag([*np.diag(prediction.carried)[:2], 0.0])
+    at_once = by_odometry(START, zero, wheels[0], wheels[-1], 3.0).carried
+    assert np.diag(covariance)[:2] == pytest.approx(np.diag(at_once)[:2], rel=1e-9)
+    assert covariance[0, 0] == pytest.approx(0.03**2 * 10.0 + (0.02 * 10.0) ** 2, rel=1e-9)
 
 
 @pytest.mark.parametrize('asked', [0.1, 0.45, 0.8, 0.95, 1.1])

@@ -292,14 +292,14 @@ class Localiser:
             covariance = prior.without_floor(covariance, alignment.refinement.covariance)
         unobserved = unobserved_directions(
             alignment.refinement.information, alignment.pose, limit=OPEN)
-        seen_ns = stamp_ns
+        seen_ns, seen_way = stamp_ns, 0.0 if self._now is None else self._now.way
         if unobserved and self._track is not None:
-            seen_ns = self._track.seen_ns
+            seen_ns, seen_way = self._track.seen_ns, self._track.seen_way
         # No velocity leads across a jump.
         self._past = () if self._open or self._track is None else (
             *self._past, self._track)[-PAST:]
         self._track = Track(
-            stamp_ns, alignment.pose, covariance, self._now, seen_ns)
+            stamp_ns, alignment.pose, covariance, self._now, seen_ns, seen_way)
         self._colours = alignment.colours
         self._given = None
         self._open, self._open_odometry = (), None

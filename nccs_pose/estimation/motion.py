@@ -48,6 +48,8 @@ _FLOOR_SIGMA = (0.02, 0.015)
 # What wheels gain in error over the first metre or radian; it grows with the square root.
 _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
+# Besides, they are taken for larger or smaller than they are by this part.
+_SCALE = 0.02
 # Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
@@ -84,6 +86,7 @@ class Track:
     :ivar covariance: of (x, y, yaw) (3, 3).
     :ivar odometry: what the wheels said then; None without odometry.
     :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
+    :ivar seen_way: how far the wheels had rolled then, metres.
     """
 
     stamp_ns: int
@@ -91,6 +94,7 @@ class Track:
     covariance: Array
     odometry: Wheels | None
     seen_ns: int
+    seen_way: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,21 +254,30 @@ def carried_on(
     :param now: what the wheels say at the stamp; None without odometry.
     """
     if last.odometry is not None and now is not None:
-        return by_odometry(last.pose, last.covariance, last.odometry, now)
+        return by_odometry(last.pose, last.covariance, last.odometry, now, last.seen_way)
     return by_velocity(past, last, stamp_ns)
 
 
-def by_odometry(pose: Pose2, covariance: Array, before: Wheels, after: Wheels) -> Prediction:
+def by_odometry(
+    pose: Pose2, covariance: Array, before: Wheels, after: Wheels,
+    seen_way: float | None = None,
+) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two moments.
 
-    They err by the whole of their way, also where it leads back.
+    They err by the whole of their way, also where it leads back: by chance, whose squares add up,
+    and by their size, whose errors do.
+
+    :param seen_way: how far they had rolled when the pose was last fixed in every direction,
+        metres; None for when they were asked first.
     """
     step = before.pose.inverse() @ after.pose
     moved = pose @ step
     distance = max(math.hypot(step.x, step.y), after.way - before.way)
     angle = max(abs(step.yaw), after.turn - before.turn)
     faster, faster_yaw = (a * after.unheard for a in _ACCELERATION)
-    sigma = math.hypot(_PER_METRE[0] * math.sqrt(distance), faster)
+    open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
+    scale = _SCALE * math.sqrt(distance * (distance + 2.0 * open_way))
+    sigma = math.hypot(_PER_METRE[0] * math.sqrt(distance), scale, faster)
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw)
     return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
