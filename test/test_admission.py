@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from nccs_pose.errors import FrameRefusedError
 from nccs_pose.estimation.admission import Admission
-from nccs_pose.estimation.motion import Odometry
+from nccs_pose.estimation.odometry import Odometry
 from nccs_pose.geometry import PinholeCamera, Pose2
 import numpy as np
 import pytest

@@ -23,11 +23,10 @@ from hypothesis import strategies as st
 from nccs_pose.estimation.motion import (
     by_odometry,
     by_velocity,
-    Odometry,
     Prediction,
     Track,
-    Wheels,
 )
+from nccs_pose.estimation.odometry import Odometry, Wheels
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 from nccs_pose.simulation.motion import integrate_twist, Twist
 import numpy as np

@@ -25,7 +25,7 @@ import time
 
 from nccs_pose.estimation.estimate import Estimate, Quality, StageTimes, State
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.estimation.motion import Odometry
+from nccs_pose.estimation.odometry import Odometry
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.paper import paper_estimate
 from nccs_pose.geometry.lines import LineMap

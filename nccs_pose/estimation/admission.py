@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from nccs_pose.errors import FrameRefusedError
-from nccs_pose.estimation.motion import Odometry
+from nccs_pose.estimation.odometry import Odometry
 from nccs_pose.geometry.camera import PinholeCamera
 import numpy as np
 from numpy.typing import NDArray

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from nccs_pose.estimation.motion import carried_on, Prediction, Track, Wheels
+from nccs_pose.estimation.motion import carried_on, Prediction, Track
+from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.geometry.pose import Array, Pose2
 
 

@@ -25,7 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.many_poses import same_pose
-from nccs_pose.estimation.motion import SPEED, Wheels
+from nccs_pose.estimation.motion import SPEED
+from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.geometry.pose import Pose2
 
 # Images that a hypothesis must have explained before it is chosen among several.

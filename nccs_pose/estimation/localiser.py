@@ -46,8 +46,9 @@ from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAS
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
-from nccs_pose.estimation.motion import carried_on, Odometry, PAST, Prediction, Track, Wheels
+from nccs_pose.estimation.motion import carried_on, PAST, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
+from nccs_pose.estimation.odometry import Odometry, Wheels
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.rivals import Rivals
 from nccs_pose.estimation.search import Searcher

@@ -37,7 +37,8 @@ import zlib
 
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
-from nccs_pose.estimation.motion import by_odometry, Wheels
+from nccs_pose.estimation.motion import by_odometry
+from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
 from nccs_pose.evaluation.tables import table

@@ -1,0 +1,152 @@
+# Copyright 2026 The nccs_pose authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Wheel odometry: what it says at any stamp that it covers, and how much it may have missed."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+import math
+
+from nccs_pose.errors import FrameRefusedError
+from nccs_pose.geometry.pose import Pose2, wrapped
+
+# Odometry further from a stamp than this says nothing about it, ns.
+_LONGEST_GAP_NS = 250_000_000
+_KEPT = 4000
+# So many samples in a row before the last one say that this was stamped ahead of its time; fewer
+# came late.
+_DISORDERED = 3
+# Wheels roll and turn no faster, m/s and rad/s, for no longer than this without a word, s. What
+# goes this much further, m and rad, from one sample to the next is another start of odometry;
+# less may be the stamps'.
+_FASTEST = (10.0, 20.0)
+_LONGEST_ROLL = 1.0
+_LEAP = (0.1, 0.2)
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """What wheels say at some moment.
+
+    :ivar pose: T_odom_base.
+    :ivar way: how far they have rolled since odometry began, metres, to and fro.
+    :ivar turn: how much they have turned the robot since, rad, to and fro.
+    :ivar unheard: what an acceleration of 1 m/s^2 or rad/s^2 may add, as they were not heard just
+        then, metres or rad: much in a gap between two samples and past the last one.
+    """
+
+    pose: Pose2
+    way: float = 0.0
+    turn: float = 0.0
+    unheard: float = 0.0
+
+
+class Odometry:
+    """Wheel odometry, interpolated at any stamp it covers."""
+
+    def __init__(self, clock_jump: float) -> None:
+        """Begin.
+
+        :param clock_jump: a stamp that goes back further than this is a new start, s.
+        """
+        self._clock_jump = clock_jump
+        self._stamps: list[int] = []
+        self._poses: list[Pose2] = []
+        # Ways and turns up to each of them.
+        self._rolled: list[tuple[float, float]] = []
+        self._late = 0
+
+    def add(self, stamp_ns: int, pose: Pose2) -> None:
+        """Take one sample; one that is not newer than the last is no news, but for several.
+
+        :raises FrameRefusedError: `odom_jump`, if the sample does not follow on the last: all
+            before it is forgotten, and it is the first.
+        """
+        if self._is_late(stamp_ns):
+            return
+        jump = self._jump(stamp_ns, pose)
+        if jump:
+            self.clear()
+        way = turn = 0.0
+        if self._stamps:
+            step, turned = _apart(self._poses[-1], pose)
+            way, turn = self._rolled[-1][0] + step, self._rolled[-1][1] + turned
+        self._stamps.append(stamp_ns)
+        self._poses.append(pose)
+        self._rolled.append((way, turn))
+        if len(self._stamps) > 2 * _KEPT:
+            del self._stamps[:_KEPT], self._poses[:_KEPT], self._rolled[:_KEPT]
+        if jump:
+            raise FrameRefusedError('odom_jump', f'odom: {jump}; odometry begins anew')
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Whether a sample is no news; what is ahead of several in a row is forgotten."""
+        ahead = self._stamps[-1] - stamp_ns if self._stamps else -1
+        if 0 <= ahead <= 1e9 * self._clock_jump:
+            self._late += ahead > 0
+            if self._late < _DISORDERED:
+                return True
+            begin = bisect_right(self._stamps, stamp_ns)
+            del self._stamps[begin:], self._poses[begin:], self._rolled[begin:]
+        self._late = 0
+        return False
+
+    def _jump(self, stamp_ns: int, pose: Pose2) -> str:
+        """How a sample does not follow on the last; empty if it does."""
+        if not self._stamps:
+            return ''
+        seconds = 1e-9 * (stamp_ns - self._stamps[-1])
+        if seconds < -self._clock_jump:
+            return f'the stamps jumped back by {-seconds:.3f} s'
+        way, turn = _apart(self._poses[-1], pose)
+        time = min(seconds, _LONGEST_ROLL)
+        if seconds > 0.0 and (
+                way > _LEAP[0] + _FASTEST[0] * time or turn > _LEAP[1] + _FASTEST[1] * time):
+            return f'{way:.3g} m and {turn:.3g} rad in {seconds:.3f} s are more than wheels can do'
+        return ''
+
+    def clear(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        self._stamps.clear()
+        self._poses.clear()
+        self._rolled.clear()
+        self._late = 0
+
+    def at(self, stamp_ns: int) -> Wheels | None:
+        """What the wheels say at a stamp; carried on a little past the last sample, else None."""
+        n = len(self._stamps)
+        if n < 2 or stamp_ns < self._stamps[0] - 1:
+            return None
+        right = min(max(bisect_right(self._stamps, stamp_ns), 1), n - 1)
+        left = right - 1
+        t0, t1 = self._stamps[left], self._stamps[right]
+        since, until = stamp_ns - t0, t1 - stamp_ns
+        if -until > _LONGEST_GAP_NS or t1 - t0 > 4 * _LONGEST_GAP_NS:
+            return None
+        share = since / (t1 - t0)
+        a, b = self._poses[left], self._poses[right]
+        way, turn = (u + share * (v - u) for u, v in zip(
+            self._rolled[left], self._rolled[right]))
+        return Wheels(
+            Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y),
+                  a.yaw + share * wrapped(b.yaw - a.yaw)),
+            # By so much a parabola leaves the straight line through two of its points.
+            way, turn, 0.5e-18 * abs(since * until))
+
+
+def _apart(a: Pose2, b: Pose2) -> tuple[float, float]:
+    """How far apart two poses are, metres and rad."""
+    return math.hypot(b.x - a.x, b.y - a.y), abs(wrapped(b.yaw - a.yaw))
