@@ -767,6 +767,86 @@ def test_a_pose_that_images_refuted_decides_nothing_later() -> None:
         assert answer.state in (State.AMBIGUOUS, State.LOST)
 
 
+@pytest.mark.parametrize('wheels', [True, False])
+@pytest.mark.parametrize('count', [1, 2])
+def test_images_that_mislead_for_a_moment_do_not_take_the_pose(wheels: bool, count: int) -> None:
+    """Of a rectangle no image would ever give it back."""
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7), wheels=wheels)
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    for _ in range(4):
+        assert drive.right(drive.go(Pose2(0.02, 0.0, 0.02)))
+    here, drive.pose = drive.pose, Pose2(-0.5, 0.2, -1.2)
+    assert [drive.go().pose for _ in range(count)] == [None] * count
+    drive.pose = here
+    for _ in range(4):
+        assert drive.right(drive.go())
+
+
+def test_between_parallel_lines_too() -> None:
+    """No search of the whole image finds a pose there, which could end what another left open."""
+    drive = Drive(replace(SCENE, line_map=RAILS), Pose2(4.0, 0.0, 0.02),
+                  LocaliserOptions(reach=3.0))
+    drive.localiser.set_prior(drive.pose, np.diag([0.03, 0.03, 0.03]) ** 2)
+    step = Pose2(0.03, 0.0, 0.0)
+    for _ in range(4):
+        assert abs(drive.error(drive.go(step))[1]) < 0.01
+    here, drive.pose = drive.pose, Pose2(-1.7, 0.1, -0.3)
+    assert drive.go().pose is None
+    drive.pose = here
+    assert drive.go(step).pose is None, 'one image more has to agree'
+    for _ in range(4):
+        answer = drive.go(step)
+        assert answer.pose is not None
+        assert abs(drive.error(answer)[1]) < 0.01
+
+
+@pytest.mark.parametrize('gap', [0.5, 0.8])
+def test_a_short_gap_without_wheels_costs_no_pose_on_a_symmetric_map(gap: float) -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7), wheels=False)
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    step = Pose2(0.03, 0.0, 0.03)
+    for _ in range(4):
+        assert drive.right(drive.go(step))
+    _gap(drive, gap)
+    # It drives on as before.
+    drive.pose = drive.pose @ Pose2(0.03 * 10.0 * (gap - 0.1), 0.0, 0.03 * 10.0 * (gap - 0.1))
+    for _ in range(3):
+        assert drive.right(drive.go(step))
+
+
+def test_a_pose_that_was_given_takes_up_wheels_that_come_later() -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7), wheels=False)
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    drive.go(change=_black)
+    drive.wheels = True
+    for _ in range(14):
+        assert drive.go(Pose2(0.02, 0.0, 0.05), change=_black).pose is None
+    assert drive.right(drive.go())
+
+
+def test_a_pose_that_is_given_as_the_clock_goes_back_is_of_the_new_time() -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.4, 0.3, 0.7), wheels=False)
+    for _ in range(2):
+        assert drive.go().state is State.AMBIGUOUS
+    drive.stamp -= 60 * 10**9
+    drive.localiser.set_prior(drive.pose, np.diag([0.1, 0.1, 0.1]) ** 2)
+    assert drive.right(drive.go())
+
+
+def test_a_blur_that_is_set_anew_is_what_the_next_search_begins_with() -> None:
+    out_of_focus = replace(SCENE, sensor=replace(SCENE.sensor, psf_sigma=4.0))
+    poses = [Pose2(0.3, -0.2, 2.0), Pose2(-0.4, 0.1, 0.5), Pose2(0.0, 0.3, -1.5)]
+    answers: dict[bool, list[State]] = {True: [], False: []}
+    for live, states in answers.items():
+        for pose in poses:
+            options = LocaliserOptions(blur=4.0)
+            drive = Drive(out_of_focus, pose, DEFAULTS if live else options)
+            if live:
+                drive.localiser.update_options(options)
+            states.append(drive.go().state)
+    assert answers[True] == answers[False]
+
+
 def test_without_wheels_an_undecided_image_does_not_bind_a_robot_that_drives_on() -> None:
     drive = Drive(SCENE, Pose2(0.0, -0.2, 2.0), wheels=False)
     for _ in range(3):

@@ -144,6 +144,16 @@ def test_wheels_err_by_all_of_their_way() -> None:
         [place, place, np.hypot(0.03, 0.05 * np.sqrt(2.0 * np.pi))], rel=1e-3)
 
 
+def test_wheels_that_stand_and_tremble_have_not_moved() -> None:
+    odometry, rng = Odometry(1.0), np.random.default_rng(3)
+    for k in range(3000):
+        x, y = 0.001 * rng.standard_normal(2)
+        odometry.add(k * SECOND // 50, Pose2(x, y, 0.001 * rng.standard_normal()))
+    at = odometry.at(59 * SECOND)
+    assert at is not None
+    assert (at.way, at.turn) == (0.0, 0.0)
+
+
 def test_wheels_that_are_taken_for_smaller_than_they_are_err_in_proportion() -> None:
     """However many images in between fix nothing of what they do."""
     zero, steps = np.zeros((3, 3)), np.linspace(0.0, 10.0, 41)

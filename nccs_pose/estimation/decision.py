@@ -47,8 +47,8 @@ def the_one_expected(
     near = [f for f in held if (
         told.holds(f.alignment.pose, f.alignment.covariance) if prediction is None
         else is_expected(f.alignment, prediction, options.innovation_gate))]
-    if not near or any(told.holds(c.pose) for c in sifted.open) or told.holds_guesses(
-            sifted.others.place, sifted.others.rotation).any():
+    if not near or any(told.holds(c.pose) for c in (*sifted.open, *sifted.rest)) or (
+            told.holds_guesses(sifted.others.place, sifted.others.rotation).any()):
         return None
     best, ratio = near[0], options.ambiguity_ratio
     if best.score < ratio * held[0].score or any(

@@ -40,6 +40,9 @@ _BETTER = 0.15
 # those that a prediction leaves open so many are tried, the nearest first.
 _APART = 0.1
 _TRIED = 4
+# A place where the robot may be lies within so many deviations of a vague prediction: what that
+# reckons with is the most that a robot does, not what it happens to do.
+_GATE = 3.0
 _ANOTHER = Objection('another pose explains the image better')
 _AS_WELL = Objection('another place where the robot may be by now explains the image as well')
 
@@ -82,7 +85,8 @@ class Elsewhere:
         here, _ = self._searcher.score(alignment.pose, segments)
         if not vague and here + _BETTER >= 1.0:
             return None
-        told = Told(prediction.pose, prediction.covariance, self._options.innovation_gate)
+        gate = min(_GATE, self._options.innovation_gate)
+        told = Told(prediction.pose, prediction.covariance, gate)
         found = self._searcher.candidates(segments, told if vague else None)
         best = found.fitted[0] if found.fitted else None
         if best is not None and best.score > here + _BETTER and not same_pose(

@@ -38,7 +38,8 @@ class State(Enum):
         return state
 
     SEARCHING = 'searching', (
-        'No pose was ever held: nothing in the images so far fits the map. None is given.')
+        'No pose was held since the start, or since a reset or an initial pose: nothing in the '
+        'images fits the map. None is given.')
     AMBIGUOUS = 'ambiguous', (
         'Two poses or more explain the image, and the second scores more than `ambiguity_ratio` '
         'of the best, in the mean of all images since they were first seen. All are candidates, '
@@ -49,10 +50,14 @@ class State(Enum):
         'are found, no line and no stretch of lines lies off by more than `largest_misfit`, no '
         'line is seen beside its place; and it lies within `innovation_gate` of the prediction '
         '(3 deviations where it rests on fewer than three lines), or two images in a row agree '
-        'on it.')
+        'on it. Where the prediction is less sure than 10 cm or 0.2 rad (after a gap without '
+        'odometry, below 3 images a second) or given by hand, no other place within it may look '
+        'the same.')
     COASTING = 'coasting', (
         'The image says too little; the last pose is carried on by odometry, for `coast_time` at '
-        'most and up to `coast_sigma`, unless an image shows another place.')
+        'most and up to `coast_sigma`, unless an image shows another place. Its covariance grows '
+        'with all of the way and all of the turns that the wheels have made, and with the time '
+        'in which they were not heard.')
     LOST = 'lost', (
         'There was a pose, and it neither explains the image nor can be carried on. None is '
         'given.')

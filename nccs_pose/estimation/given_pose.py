@@ -39,19 +39,31 @@ class GivenPose:
         """
         self._told = Prediction(pose, covariance, by_odometry=False, is_given=True)
         self._track: Track | None = None
+        # How far the wheels had rolled when they were first heard.
+        self._way: float | None = None
+
+    @property
+    def is_new(self) -> bool:
+        """Whether no image has been asked about yet."""
+        return self._track is None
 
     def expected(self, stamp_ns: int, odometry: Wheels | None) -> Prediction | None:
         """Where the robot is at an image; None where it may be anywhere by now.
 
         :param odometry: what the wheels say then; without, the robot may have driven at any speed.
         """
-        if self._track is None:
+        expected: Prediction | None = self._told
+        if self._track is not None and self._track.stamp_ns != stamp_ns:
+            carried = carried_on((), self._track, odometry, stamp_ns)
+            expected = None if carried is None else replace(carried, is_given=True)
+        # Without wheels what it may have driven since counts from the first image without.
+        if expected is not None and (self._track is None or odometry is not None):
+            if self._way is None and odometry is not None:
+                self._way = odometry.way
+            self._told = expected
             self._track = Track(
-                stamp_ns, self._told.pose, self._told.carried, odometry, stamp_ns)
-        if self._track.stamp_ns == stamp_ns:
-            return self._told
-        expected = carried_on((), self._track, odometry, stamp_ns)
-        return None if expected is None else replace(expected, is_given=True)
+                stamp_ns, expected.pose, expected.carried, odometry, stamp_ns, self._way)
+        return expected
 
     def forget_odometry(self) -> None:
         """No step of the wheels leads on from what they told until now."""

@@ -71,6 +71,8 @@ _DEFAULTS = LocaliserOptions()
 # more than so many pixels for each of the image's width.
 _CLAIMED = 0.5
 _FOREIGN = 0.25
+# What is expected is forgotten when images have shown other places for so long, ns.
+_REFUTED_NS = 500_000_000
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
 
@@ -93,6 +95,8 @@ class Localiser:
                     f'width {line.width:g} m, is no tape on the floor: images show only those '
                     'with z = 0 and a width')
         self._map = line_map
+        self.options = options
+        self._colours: tuple[LineColour, ...] = ()
         self._table = FloorTable(rig, options.reach)
         self._symmetries = map_symmetries(line_map)[1:]
         self._odometry = Odometry(options.clock_jump)
@@ -105,6 +109,9 @@ class Localiser:
 
         A new reach needs new tables and is taken over by a new localiser only.
         """
+        if options.blur != self.options.blur:
+            self._colours = tuple(
+                replace(colour, blur=options.blur) for colour in self._colours)
         self.options = options
         aligner = Aligner(self._table, self._map, options)
         self._nominal_colours = aligner.nominal_colours
@@ -140,6 +147,10 @@ class Localiser:
         self._open: tuple[Hypothesis, ...] = ()
         self._open_ns = 0
         self._open_odometry: Wheels | None = None
+        # So many images in a row agreed with what was expected meanwhile, and from when on they
+        # showed none of the open poses there.
+        self._agreed = 0
+        self._refuted_ns: int | None = None
         self._doubts: frozenset[int] = frozenset()
         # Lines that the poses since the last search rest on.
         self._shown: frozenset[int] = frozenset()
@@ -174,6 +185,11 @@ class Localiser:
                 self._track = replace(self._track, odometry=None)
             raise
 
+    @property
+    def last_odometry_ns(self) -> int | None:
+        """The stamp of the last sample of odometry; None without any."""
+        return self._odometry.last_ns
+
     def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> Estimate:
         """Estimate the pose that an image was taken from.
 
@@ -182,8 +198,11 @@ class Localiser:
         :raises FrameRefusedError: if the frame must not be used; the cause says why.
         """
         if not self._admission.admit(stamp_ns, image):
+            given = self._given if self._given is not None and self._given.is_new else None
             self._odometry.clear()
             self.relocalise()
+            # Said since the last image, it is of the time that begins.
+            self._given = given
         watch = Stopwatch()
         self._now = self._odometry.at(stamp_ns)
         prediction = None if self._track is None else carried_on(
@@ -229,6 +248,13 @@ class Localiser:
             held = [f for f in held if f.score > here or same_pose(
                 f.alignment.pose, refused.alignment.pose)]
         if not held:
+            if prediction is not None and self._open:
+                followed = self._follower.follow(
+                    image, prediction, self._colours, self._doubts, watch)
+                self._agreed = self._agreed + 1 if isinstance(followed, Found) else 0
+                if isinstance(followed, Found) and self._agreed >= LEAST_IMAGES:
+                    return self._tracking(
+                        stamp_ns, followed, prediction, watch, 'the pose explains the image')
             trusted = None if given is None else self._trusted(image, given, segments, watch)
             if trusted is not None:
                 return self._tracking(
@@ -255,9 +281,12 @@ class Localiser:
         if hypotheses and told is not None and not any(
                 told.holds(pose) for pose in (
                     *(f.alignment.pose for f in held), *(c.pose for c in sifted.open))):
-            # For the second time none of them is where it was expected. Carried on, that would
-            # sooner or later agree with one of them by chance.
-            self._track, self._past, self._given = None, (), None
+            # None of them is where it was expected. Carried on for long, that would agree with one
+            # of them by chance.
+            if self._refuted_ns is None:
+                self._refuted_ns = stamp_ns
+            elif stamp_ns - self._refuted_ns >= _REFUTED_NS:
+                self._track, self._past, self._given = None, (), None
         return self._undecided(stamp_ns, held, more, watch)
 
     def _trusted(
@@ -293,7 +322,7 @@ class Localiser:
             covariance = prior.without_floor(covariance, alignment.refinement.covariance)
         unobserved = unobserved_directions(
             alignment.refinement.information, alignment.pose, limit=OPEN)
-        seen_ns, seen_way = stamp_ns, 0.0 if self._now is None else self._now.way
+        seen_ns, seen_way = stamp_ns, None if self._now is None else self._now.way
         if unobserved and self._track is not None:
             seen_ns, seen_way = self._track.seen_ns, self._track.seen_way
         # No velocity leads across a jump.
@@ -303,6 +332,7 @@ class Localiser:
             stamp_ns, alignment.pose, covariance, self._now, seen_ns, seen_way)
         self._colours = alignment.colours
         self._given = None
+        self._agreed, self._refuted_ns = 0, None
         self._open, self._open_odometry = (), None
         self._doubts = settled_doubts(self._doubts, alignment)
         shown = lines_shown(alignment)

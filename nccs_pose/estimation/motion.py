@@ -56,7 +56,7 @@ class Track:
     :ivar covariance: of (x, y, yaw) (3, 3).
     :ivar odometry: what the wheels said then; None without odometry.
     :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
-    :ivar seen_way: how far the wheels had rolled then, metres.
+    :ivar seen_way: how far the wheels had rolled then, metres; None if they did not say.
     """
 
     stamp_ns: int
@@ -64,7 +64,7 @@ class Track:
     covariance: Array
     odometry: Wheels | None
     seen_ns: int
-    seen_way: float = 0.0
+    seen_way: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

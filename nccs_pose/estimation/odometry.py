@@ -26,6 +26,8 @@ from nccs_pose.geometry.pose import Pose2, wrapped
 # Odometry further from a stamp than this says nothing about it, ns.
 _LONGEST_GAP_NS = 250_000_000
 _KEPT = 4000
+# Less than this, m and rad, is no way: the samples of wheels that stand may tremble.
+_JITTER = (0.01, 0.01)
 # So many samples in a row before the last one say that this was stamped ahead of its time; fewer
 # came late.
 _DISORDERED = 3
@@ -65,8 +67,9 @@ class Odometry:
         self._clock_jump = clock_jump
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
-        # Ways and turns up to each of them.
+        # Ways and turns up to each of them, and the last pose up to which they were counted.
         self._rolled: list[tuple[float, float]] = []
+        self._counted = Pose2(0.0, 0.0, 0.0)
         self._late = 0
 
     def add(self, stamp_ns: int, pose: Pose2) -> None:
@@ -80,10 +83,12 @@ class Odometry:
         jump = self._jump(stamp_ns, pose)
         if jump:
             self.clear()
-        way = turn = 0.0
-        if self._stamps:
-            step, turned = _apart(self._poses[-1], pose)
-            way, turn = self._rolled[-1][0] + step, self._rolled[-1][1] + turned
+        way, turn = self._rolled[-1] if self._rolled else (0.0, 0.0)
+        step, turned = _apart(self._counted, pose) if self._rolled else (math.inf, math.inf)
+        if step > _JITTER[0] or turned > _JITTER[1]:
+            if self._rolled:
+                way, turn = way + step, turn + turned
+            self._counted = pose
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
         self._rolled.append((way, turn))
@@ -117,6 +122,11 @@ class Odometry:
                 way > _LEAP[0] + _FASTEST[0] * time or turn > _LEAP[1] + _FASTEST[1] * time):
             return f'{way:.3g} m and {turn:.3g} rad in {seconds:.3f} s are more than wheels can do'
         return ''
+
+    @property
+    def last_ns(self) -> int | None:
+        """The stamp of the last sample; None without any."""
+        return self._stamps[-1] if self._stamps else None
 
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""

@@ -82,13 +82,16 @@ def _text(value: object) -> str:
 
 
 def pose_status(
-    node: str, lifecycle: str, problem: str, estimate: Estimate | None, age: float,
+    node: str, lifecycle: str, problem: str, silence: str, estimate: Estimate | None, age: float,
+    odometry_lag: float,
 ) -> DiagnosticStatus:
     """State of the estimate.
 
     :param lifecycle: label of the node's lifecycle state.
     :param problem: why no pose is given although the estimator might; empty if none.
+    :param silence: why no image comes; empty if they come. Then the estimate is none of now.
     :param age: seconds since the stamp of the last pose; NaN if there was none.
+    :param odometry_lag: of the last sample of odometry behind the last image, s; NaN without.
     """
     name = f'{node}: pose'
     if lifecycle != 'active' or problem:
@@ -97,15 +100,17 @@ def pose_status(
             'lifecycle': lifecycle, 'state': 'stopped' if lifecycle != 'active' else 'withheld',
             'reason': problem or lifecycle, 'age_s': age})
     if estimate is None:
-        return status(name, DiagnosticStatus.WARN, 'no image yet', {
-            'lifecycle': lifecycle, 'state': State.SEARCHING.value, 'reason': 'no image yet',
+        words = silence or 'no image yet'
+        return status(name, DiagnosticStatus.WARN, words, {
+            'lifecycle': lifecycle, 'state': State.SEARCHING.value, 'reason': words,
             'age_s': age})
     quality = estimate.quality
     values: dict[str, object] = {
         'lifecycle': lifecycle,
-        'state': estimate.state.value,
-        'reason': estimate.reason,
+        'state': 'silent' if silence else estimate.state.value,
+        'reason': silence or estimate.reason,
         'age_s': age,
+        'odometry_lag_s': odometry_lag,
         'lines_used': quality.lines_used,
         'points_used': quality.points_used,
         'residual_px': float(quality.residual_px),
@@ -121,6 +126,10 @@ def pose_status(
     if estimate.covariance is not None:
         for key, variance in zip(('x_m', 'y_m', 'yaw_rad'), estimate.covariance.diagonal()):
             values[f'sigma_{key}'] = math.sqrt(float(variance))
+    if silence:
+        return status(
+            name, DiagnosticStatus.WARN,
+            f'{silence}; the last image said {estimate.state.value}', values)
     words = f'{estimate.state.value}: {estimate.reason}'
     return status(name, LEVELS[estimate.state], words, values)
 

@@ -120,6 +120,7 @@ class ImageStream:
 
     def _use(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
         self.arrived = time.monotonic()
+        self._incompatible = ''
         self._tally.received += 1
         self._count_missing(info.get('publication_sequence_number'))
         stamp_ns = stamp_to_ns(message.header.stamp)

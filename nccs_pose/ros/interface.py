@@ -53,7 +53,9 @@ ODOM = Endpoint(
     'Wheel odometry (optional): predicts the pose between images.', False, 100)
 INITIAL_POSE = Endpoint(
     'initialpose', 'geometry_msgs/msg/PoseWithCovarianceStamped',
-    "RViz's 2D Pose Estimate, in the map frame; a covariance of zeros takes initial_pose_sigma.",
+    "RViz's 2D Pose Estimate, in the map frame; a covariance of zeros takes initial_pose_sigma. "
+    'It holds from the next image on and is carried on by odometry until an image decides; '
+    'without odometry for a second at most, and ever less surely.',
     True, 5)
 INPUTS = (IMAGE, IMAGE_COMPRESSED, CAMERA_INFO, ODOM, INITIAL_POSE)
 
@@ -90,7 +92,8 @@ TF_MODES = (
 STATUSES = (
     ('`localiser: pose`',
      'lifecycle, state (`searching`, `ambiguous`, `tracking`, `coasting`, `lost`; `stopped`, '
-     '`withheld`), reason, age_s, lines_used, points_used, residual_px, expected_px, explained, '
+     '`withheld`, `silent`), reason, age_s, odometry_lag_s (of its last sample behind the last '
+     'image; nan without any), lines_used, points_used, residual_px, expected_px, explained, '
      'claimed, ambiguity, unobserved, candidates, sigma_x_m, sigma_y_m, sigma_yaw_rad'),
     ('`localiser: images`',
      'topic, publishers, frames_received, frames_answered, frames_dropped_busy, '

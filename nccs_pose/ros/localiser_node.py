@@ -225,6 +225,9 @@ class LocaliserNode(LifecycleNode):
             response.success, response.message = False, 'the node is not configured'
             return response
         self._localiser.relocalise()
+        # What the last image said is forgotten.
+        self._estimate = None
+        self._report_diagnostics()
         response.success, response.message = True, 'searching everywhere from the next image on'
         return response
 
@@ -268,6 +271,13 @@ class LocaliserNode(LifecycleNode):
             return self._configuration_problem
         return 'paused' if self._paused else self._withheld()
 
+    def _odometry_lag(self) -> float:
+        """Of the last sample of odometry behind the last image, s; NaN without either."""
+        if self._localiser is None or self._estimate is None:
+            return math.nan
+        last_ns = self._localiser.last_odometry_ns
+        return math.nan if last_ns is None else 1e-9 * (self._estimate.stamp_ns - last_ns)
+
     def _summary(self) -> tuple[Any, ...]:
         """What a change of makes a report due at once."""
         return self._estimate.state if self._estimate else None, self._problem()
@@ -290,13 +300,15 @@ class LocaliserNode(LifecycleNode):
         age = (math.nan if self._pose_stamp_ns is None
                else 1e-9 * (now.nanoseconds - self._pose_stamp_ns))
         name, tally = self.get_fully_qualified_name().lstrip('/'), self._tally
-        statuses = [diagnostics.pose_status(name, label, self._problem(), self._estimate, age)]
+        silence = '' if self._stream is None else self._stream.problem(
+            self._options.silence_warning)
+        statuses = [diagnostics.pose_status(
+            name, label, self._problem(), silence, self._estimate, age, self._odometry_lag())]
         if self._stream is not None:
             troubles = sum(tally.refused.values()) + sum(tally.errors.values())
             statuses += [
                 diagnostics.image_status(
-                    name, self._stream.topic, self._stream.publishers, tally,
-                    self._stream.problem(self._options.silence_warning),
+                    name, self._stream.topic, self._stream.publishers, tally, silence,
                     troubles - self._reported[0], tally.lost - self._reported[1]),
                 diagnostics.time_status(
                     name, self._estimate, self._stream.decode_s, self._latency_s)]

@@ -94,6 +94,8 @@ class NodeOptions:
             frame = getattr(self, name)
             if not frame or frame.startswith('/'):
                 raise OptionError(f'{name} = {frame!r}: a frame is not empty and has no leading /')
+        if self.frame_prefix.startswith('/'):
+            raise OptionError(f'frame_prefix = {self.frame_prefix!r}: a frame has no leading /')
 
     @property
     def odom(self) -> str:

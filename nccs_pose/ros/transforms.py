@@ -85,6 +85,9 @@ class TransformOutput:
         if self._options.tf_mode == 'map_to_base':
             self._send(stamp_ns, self._options.base, pose)
         elif self._options.tf_mode == 'map_to_odom':
+            if stamp_ns < 0:
+                self._refuse('tf_missing', f'no transform is of a time before zero: {stamp_ns} ns')
+                return
             if self._pending and stamp_ns < self._pending[-1][0]:
                 self._pending.clear()  # the clock was set back
             self._pending.append((stamp_ns, pose))

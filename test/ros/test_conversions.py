@@ -25,14 +25,18 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.msg import Odometry
-from nccs_pose.errors import FrameRefusedError
+from nccs_pose.errors import FrameRefusedError, OptionError
+from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros import conversions as c
 from nccs_pose.ros.camera_check import contradiction
+from nccs_pose.ros.diagnostics import pose_status
+from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
@@ -211,6 +215,7 @@ def test_camera_info_of_another_camera_is_said_with_both_numbers(changes, words)
 
 
 BUILD_EVERY_MESSAGE = """
+import math
 import numpy as np
 from nccs_pose.estimation.estimate import Candidate, Estimate, State
 from nccs_pose.geometry.pose import Pose2
@@ -229,8 +234,10 @@ for message in (
     m.marker_array('map', estimate, arena_rig(), arena_map()),
     m.marker_array('map', Estimate(5, State.LOST, 'gone'), arena_rig(), arena_map()),
     d.diagnostic_array(c.ns_to_stamp(1), [
-        d.pose_status('n', 'active', '', estimate, 0.1), d.pose_status('n', 'active', '', None, 1),
-        d.pose_status('n', 'inactive', '', None, 1), d.pose_status('n', 'active', 'x', None, 1),
+        d.pose_status('n', 'active', '', '', estimate, 0.1, 0.02),
+        d.pose_status('n', 'active', '', '', None, 1, math.nan),
+        d.pose_status('n', 'inactive', '', '', None, 1, math.nan),
+        d.pose_status('n', 'active', 'x', '', None, 1, math.nan),
         d.image_status('n', '/image', 1, tally, '', 1, 1),
         d.time_status('n', estimate, 0.1, 0.2)]),
 ):
@@ -245,3 +252,21 @@ def test_every_field_has_the_right_python_type(checks: str):
         [sys.executable, '-c', BUILD_EVERY_MESSAGE], capture_output=True, text=True, check=False,
         env={**os.environ, 'ROS_PYTHON_CHECK_FIELDS': checks})
     assert done.stdout.strip() == 'all built', done.stderr
+
+
+def test_a_pose_of_images_that_no_longer_come_is_no_good_news() -> None:
+    estimate = Estimate(5, State.TRACKING, 'well', Pose2(1.0, 2.0, 3.0), np.eye(3))
+    for silence, state, level in (
+            ('', 'tracking', DiagnosticStatus.OK),
+            ('nothing publishes /image', 'silent', DiagnosticStatus.WARN)):
+        shown = pose_status('n', 'active', '', silence, estimate, 7.0, 0.25)
+        values = {entry.key: entry.value for entry in shown.values}
+        assert (shown.level, values['state']) == (level, state)
+        assert values['odometry_lag_s'] == '0.25'
+        assert silence in shown.message
+
+
+def test_a_prefix_of_frames_has_no_leading_slash() -> None:
+    assert NodeOptions(frame_prefix='robot/').odom == 'robot/odom'
+    with pytest.raises(OptionError, match='frame_prefix'):
+        NodeOptions(frame_prefix='/robot/')
