@@ -47,14 +47,28 @@ def the_one_expected(
     near = [f for f in held if (
         told.holds(f.alignment.pose, f.alignment.covariance) if prediction is None
         else is_expected(f.alignment, prediction, options.innovation_gate))]
-    if not near or any(told.holds(c.pose) for c in (*sifted.open, *sifted.rest)) or (
-            told.holds_guesses(sifted.others.place, sifted.others.rotation).any()):
+    if not near or _leaves_any(told, sifted):
         return None
     best, ratio = near[0], options.ambiguity_ratio
     if best.score < ratio * held[0].score or any(
             f.score >= ratio * best.score for f in near[1:]):
         return None
     return best
+
+
+def may_show(told: Told, held: Sequence[Found], sifted: Sifted) -> bool:
+    """Whether an image may show a pose where it is told.
+
+    :param held: the poses that explain it.
+    :param sifted: what else the search of it left.
+    """
+    return any(told.holds(f.alignment.pose) for f in held) or _leaves_any(told, sifted)
+
+
+def _leaves_any(told: Told, sifted: Sifted) -> bool:
+    """Whether there is a pose where it is told that was not laid on the image."""
+    return any(told.holds(c.pose) for c in (*sifted.open, *sifted.rest)) or bool(
+        told.holds_guesses(sifted.others.place, sifted.others.rotation).any())
 
 
 def left_open(

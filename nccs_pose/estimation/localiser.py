@@ -31,7 +31,7 @@ from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import OPEN
 from nccs_pose.estimation.case import Case
-from nccs_pose.estimation.decision import left_open, the_one_expected
+from nccs_pose.estimation.decision import left_open, may_show, the_one_expected
 from nccs_pose.estimation.estimate import (
     Candidate,
     Doubted,
@@ -147,8 +147,8 @@ class Localiser:
         self._open: tuple[Hypothesis, ...] = ()
         self._open_ns = 0
         self._open_odometry: Wheels | None = None
-        # So many images in a row agreed with what was expected meanwhile, and from when on they
-        # showed none of the open poses there.
+        # So many images in a row agreed meanwhile with what was expected; and since when they have
+        # shown nothing there.
         self._agreed = 0
         self._refuted_ns: int | None = None
         self._doubts: frozenset[int] = frozenset()
@@ -248,13 +248,11 @@ class Localiser:
             held = [f for f in held if f.score > here or same_pose(
                 f.alignment.pose, refused.alignment.pose)]
         if not held:
-            if prediction is not None and self._open:
-                followed = self._follower.follow(
-                    image, prediction, self._colours, self._doubts, watch)
-                self._agreed = self._agreed + 1 if isinstance(followed, Found) else 0
-                if isinstance(followed, Found) and self._agreed >= LEAST_IMAGES:
-                    return self._tracking(
-                        stamp_ns, followed, prediction, watch, 'the pose explains the image')
+            followed = None if prediction is None or not self._open else self._followed_again(
+                image, prediction, watch)
+            if followed is not None:
+                return self._tracking(
+                    stamp_ns, followed, prediction, watch, 'the pose explains the image')
             trusted = None if given is None else self._trusted(image, given, segments, watch)
             if trusted is not None:
                 return self._tracking(
@@ -263,6 +261,7 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
+        self._agreed = 0
         chosen = the_one_expected(held, sifted, told, prediction, self.options)
         if chosen is not None:
             words = 'found by searching the whole image'
@@ -278,16 +277,28 @@ class Localiser:
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
                 stamp_ns, found, None, watch, 'found by searching the whole image', held)
-        if hypotheses and told is not None and not any(
-                told.holds(pose) for pose in (
-                    *(f.alignment.pose for f in held), *(c.pose for c in sifted.open))):
-            # None of them is where it was expected. Carried on for long, that would agree with one
-            # of them by chance.
+        if told is not None and not may_show(told, held, sifted):
+            # Carried on for long, what was expected would agree with one of them by chance.
             if self._refuted_ns is None:
                 self._refuted_ns = stamp_ns
             elif stamp_ns - self._refuted_ns >= _REFUTED_NS:
                 self._track, self._past, self._given = None, (), None
         return self._undecided(stamp_ns, held, more, watch)
+
+    def _followed_again(
+        self, image: NDArray[np.uint8], prediction: Prediction, watch: Stopwatch,
+    ) -> Found | None:
+        """The pose that was expected before others were left open, once two images show it.
+
+        Those in a row of which a search of the whole shows nothing, as where lines are parallel.
+        """
+        followed = self._follower.follow(
+            image, prediction, self._colours, self._doubts, watch)
+        if not isinstance(followed, Found):
+            self._agreed = 0
+            return None
+        self._agreed += 1
+        return followed if self._agreed >= LEAST_IMAGES else None
 
     def _trusted(
         self, image: NDArray[np.uint8], given: Prediction, segments: tuple[FloorSegment, ...],
