@@ -22,10 +22,12 @@ from typing import Any
 from nccs_pose.cli import main
 from nccs_pose.estimation.estimate import Candidate, Estimate, State
 from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.simulation.scene import arena_map
+from nccs_pose.simulation.renderer import render
+from nccs_pose.simulation.scene import arena_map, arena_scene
 import numpy as np
 import pytest
 
@@ -122,3 +124,23 @@ def test_a_wrong_pose_is_the_commands_result(monkeypatch: pytest.MonkeyPatch) ->
     answer = Estimate(0, State.TRACKING, '', FAR, np.diag((1e-4, 1e-4, 1e-4)))
     monkeypatch.setattr(Localiser, 'process', lambda *_: answer)
     assert main(['starts', 'faint', '--trials', '1', '--widths', '160']) == 1
+
+
+@pytest.mark.parametrize('seed', [5, 9])
+def test_a_vague_pose_decides_for_no_place_while_others_near_it_were_passed_over(
+        seed: int) -> None:
+    """On the lattice, given as by RViz: 0.5 m and 15 degrees allow several cells."""
+    place = next(place for place in PLACES if place.name == 'lattice')
+    scene = arena_scene(1280)
+    look = replace(scene.appearance, room=None, obstacles=())
+    scene = replace(scene, line_map=place.line_map, appearance=look)
+    localiser = Localiser(scene.rig, scene.line_map, place.options)
+    rng = np.random.default_rng(seed)
+    pose = Pose2(*(rng.uniform(-0.25, 0.25, 2) * 11.0), rng.uniform(-np.pi, np.pi))
+    for k in range(-5, 16):
+        localiser.add_odometry(k * 20_000_000, Pose2(0.0, 0.0, 0.0))
+    given = pose @ Pose2(*(rng.normal(size=3) * [0.05, 0.05, 0.02]))
+    localiser.set_prior(given, np.diag([0.25, 0.25, 0.0685]))
+    for k in range(3):
+        answer = localiser.process(k * 100_000_000, render(scene, pose, rng))
+        assert answer.pose is None or same_pose(answer.pose, pose)
