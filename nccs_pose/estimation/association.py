@@ -26,7 +26,7 @@ import math
 from typing import NamedTuple
 
 from nccs_pose.estimation.estimate import Candidate
-from nccs_pose.estimation.floor_points import half_strip
+from nccs_pose.estimation.floor_points import footprints, half_strip
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
@@ -35,7 +35,7 @@ from nccs_pose.estimation.strip_scores import Place, StripScorer
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
-from nccs_pose.geometry.floor_table import Complex, FloorTable
+from nccs_pose.geometry.floor_table import as_points, Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
@@ -162,11 +162,8 @@ class Associator:
         turn, nearest = complex(math.cos(pose.yaw), math.sin(pose.yaw)), self._place.nearest
         which, across = nearest.at(
             turn * floor + complex(pose.x, pose.y), nearest.layers((colour,)))
-        normal = nearest.normal.take(which) * turn.conjugate()
-        x, y = normal.real, normal.imag
-        footprint = np.sqrt(
-            spread[:, 0] * x * x + 2.0 * spread[:, 1] * x * y + spread[:, 2] * y * y)
-        return np.abs(across) < half_strip(width, footprint)
+        normals = as_points(nearest.normal.take(which) * turn.conjugate())
+        return np.abs(across) < half_strip(width, footprints(spread, normals))
 
     def _scorer(self, segments: tuple[FloorSegment, ...]) -> StripScorer:
         """Of the strips, which are most often those that were last asked about."""

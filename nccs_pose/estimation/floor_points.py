@@ -182,10 +182,14 @@ def misplaced(
     :param of: the line of each point (P,).
     """
     by_floor = np.column_stack([normals, -offsets]).take(of, axis=0)
-    by_spread = (squares(normals) * [1.0, 2.0, 1.0]).take(of, axis=0)
     off = np.einsum('pi,pi->p', points.floor, by_floor)
-    square = np.einsum('pi,pi->p', points.spread, by_spread)
-    return np.abs(off) > half_strip(width, np.sqrt(square))
+    return np.abs(off) > half_strip(
+        width, footprints(points.spread, normals.take(of, axis=0)))
+
+
+def footprints(spread: Array, normals: Array) -> Array:
+    """How far pixels of spreads (P, 3) reach along normals of their own (P, 2), metres (P,)."""
+    return np.sqrt(np.einsum('pi,pi->p', spread, squares(normals) * [1.0, 2.0, 1.0]))
 
 
 def half_strip(width: float, footprint: Array) -> Array:

@@ -147,9 +147,7 @@ class Localiser:
         self._open: tuple[Hypothesis, ...] = ()
         self._open_ns = 0
         self._open_odometry: Wheels | None = None
-        # So many images in a row agreed meanwhile with what was expected; and since when they have
-        # shown nothing there.
-        self._agreed = 0
+        # Since when images have shown nothing where it was expected.
         self._refuted_ns: int | None = None
         self._doubts: frozenset[int] = frozenset()
         # Lines that the poses since the last search rest on.
@@ -208,9 +206,8 @@ class Localiser:
         prediction = None if self._track is None else carried_on(
             self._past, self._track, self._now, stamp_ns)
         watch.lap('predict')
-        # While poses are open, what agrees with the one that was expected is one of them.
-        if prediction is None or self._open:
-            return self._search(stamp_ns, image, prediction, Refused(), watch)
+        if prediction is None:
+            return self._search(stamp_ns, image, None, Refused(), watch)
         followed = self._follower.follow(image, prediction, self._colours, self._doubts, watch)
         if isinstance(followed, Found):
             return self._tracking(
@@ -248,11 +245,6 @@ class Localiser:
             held = [f for f in held if f.score > here or same_pose(
                 f.alignment.pose, refused.alignment.pose)]
         if not held:
-            followed = None if prediction is None or not self._open else self._followed_again(
-                image, prediction, watch)
-            if followed is not None:
-                return self._tracking(
-                    stamp_ns, followed, prediction, watch, 'the pose explains the image')
             trusted = None if given is None else self._trusted(image, given, segments, watch)
             if trusted is not None:
                 return self._tracking(
@@ -261,7 +253,6 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        self._agreed = 0
         chosen = the_one_expected(held, sifted, told, prediction, self.options)
         if chosen is not None:
             words = 'found by searching the whole image'
@@ -284,21 +275,6 @@ class Localiser:
             elif stamp_ns - self._refuted_ns >= _REFUTED_NS:
                 self._track, self._past, self._given = None, (), None
         return self._undecided(stamp_ns, held, more, watch)
-
-    def _followed_again(
-        self, image: NDArray[np.uint8], prediction: Prediction, watch: Stopwatch,
-    ) -> Found | None:
-        """The pose that was expected before others were left open, once two images show it.
-
-        Those in a row of which a search of the whole shows nothing, as where lines are parallel.
-        """
-        followed = self._follower.follow(
-            image, prediction, self._colours, self._doubts, watch)
-        if not isinstance(followed, Found):
-            self._agreed = 0
-            return None
-        self._agreed += 1
-        return followed if self._agreed >= LEAST_IMAGES else None
 
     def _trusted(
         self, image: NDArray[np.uint8], given: Prediction, segments: tuple[FloorSegment, ...],
@@ -343,7 +319,7 @@ class Localiser:
             stamp_ns, alignment.pose, covariance, self._now, seen_ns, seen_way)
         self._colours = alignment.colours
         self._given = None
-        self._agreed, self._refuted_ns = 0, None
+        self._refuted_ns = None
         self._open, self._open_odometry = (), None
         self._doubts = settled_doubts(self._doubts, alignment)
         shown = lines_shown(alignment)

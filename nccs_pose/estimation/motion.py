@@ -92,7 +92,7 @@ class Prediction:
         """The inverse of :attr:`covariance`."""
         return inverse(self.covariance)
 
-    @property
+    @cached_property
     def is_vague(self) -> bool:
         """Whether an image that agrees with it may show another place that looks the same."""
         (xx, xy, _), (_, yy, _), (_, _, tt) = self.carried.tolist()
