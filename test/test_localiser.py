@@ -230,6 +230,15 @@ def test_driving_on_decides_between_equal_poses() -> None:
     assert answers[-1].state is State.TRACKING
 
 
+def test_poses_that_are_left_open_are_carried_on_while_nothing_is_seen() -> None:
+    drive = Drive(replace(SCENE, line_map=RECTANGLE), Pose2(0.5, 0.3, 0.4))
+    assert drive.go().state is State.AMBIGUOUS
+    for _ in range(3):
+        blind = drive.go(Pose2(0.3, 0.0, 0.2), change=_black)
+        assert blind.state is State.SEARCHING
+        assert any(_near(c.pose, drive.pose) for c in blind.candidates)
+
+
 def _hall_of_bays() -> tuple[Scene, Localiser]:
     bays = [_line((x, y), (x, y + 2.0)) for x in np.arange(-13.8, 14.0, 1.2) for y in (0.0, 3.0)]
     hall = LineMap((_line((-14.4, 0.0), (14.4, 0.0)), _line((-14.4, 5.0), (14.4, 5.0)), *bays))

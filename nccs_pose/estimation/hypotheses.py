@@ -52,20 +52,35 @@ class Hypothesis:
         return sum(self.scores) / len(self.scores)
 
 
-def carried(
-    hypotheses: Sequence[Hypothesis], before: Wheels | None, now: Wheels | None, seconds: float,
-) -> tuple[Hypothesis, ...]:
-    """Move hypotheses on by what the wheels did; without wheels they are somewhere near.
+@dataclass(frozen=True, eq=False)
+class OpenPoses:
+    """The hypotheses that the last image which showed any left.
 
-    :param before: what these said when they were; ``now`` what they say at present.
-    :param seconds: from then till now.
+    :ivar hypotheses: the best first; none where there is nothing to decide.
+    :ivar stamp_ns: of that image.
+    :ivar odometry: what the wheels said then; None without odometry.
     """
-    if before is None or now is None:
-        way, turn = (speed * seconds for speed in SPEED)
-        return tuple(
-            replace(h, apart=(h.apart[0] + way, h.apart[1] + turn)) for h in hypotheses)
-    step = before.pose.inverse() @ now.pose
-    return tuple(replace(h, pose=h.pose @ step) for h in hypotheses)
+
+    hypotheses: tuple[Hypothesis, ...] = ()
+    stamp_ns: int = 0
+    odometry: Wheels | None = None
+
+    def __bool__(self) -> bool:
+        """Whether anything is left to decide."""
+        return bool(self.hypotheses)
+
+    def at(self, stamp_ns: int, odometry: Wheels | None) -> tuple[Hypothesis, ...]:
+        """Where they are at another image; without wheels somewhere near.
+
+        :param odometry: what the wheels say then.
+        """
+        if self.odometry is None or odometry is None:
+            seconds = 1e-9 * (stamp_ns - self.stamp_ns)
+            way, turn = (speed * seconds for speed in SPEED)
+            return tuple(replace(h, apart=(h.apart[0] + way, h.apart[1] + turn))
+                         for h in self.hypotheses)
+        step = self.odometry.pose.inverse() @ odometry.pose
+        return tuple(replace(h, pose=h.pose @ step) for h in self.hypotheses)
 
 
 def confronted(

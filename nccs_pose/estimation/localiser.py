@@ -42,7 +42,7 @@ from nccs_pose.estimation.estimate import (
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.given_pose import GivenPose
-from nccs_pose.estimation.hypotheses import ambiguity, carried, Hypothesis, LEAST_IMAGES
+from nccs_pose.estimation.hypotheses import ambiguity, LEAST_IMAGES, OpenPoses
 from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.many_poses import same_pose
@@ -143,10 +143,8 @@ class Localiser:
         self._colours = self._fresh_colours()
         # What the wheels say at the image in hand.
         self._now: Wheels | None = None
-        # Poses among which no image has decided yet, and when, and what the wheels said then.
-        self._open: tuple[Hypothesis, ...] = ()
-        self._open_ns = 0
-        self._open_odometry: Wheels | None = None
+        # Poses among which no image has decided yet.
+        self._open = OpenPoses()
         # Since when images have shown nothing where it was expected.
         self._refuted_ns: int | None = None
         self._doubts: frozenset[int] = frozenset()
@@ -176,7 +174,7 @@ class Localiser:
         try:
             self._odometry.add(stamp_ns, pose)
         except FrameRefusedError:
-            self._open_odometry = None
+            self._open = replace(self._open, odometry=None)
             if self._given is not None:
                 self._given.forget_odometry()
             if self._track is not None:
@@ -219,8 +217,7 @@ class Localiser:
         refused: Refused, watch: Stopwatch,
     ) -> Estimate:
         """Look for every pose that explains the image, and take the one that is left, if any."""
-        hypotheses = carried(
-            self._open, self._open_odometry, self._now, 1e-9 * (stamp_ns - self._open_ns))
+        hypotheses = self._open.at(stamp_ns, self._now)
         given = None if self._given is None else self._given.expected(stamp_ns, self._now)
         told = self._told(given, prediction)
         looks: dict[Sight, Sifted] = {}
@@ -260,10 +257,10 @@ class Localiser:
                 words = 'several poses explain the image; the one expected was taken'
             return self._tracking(stamp_ns, chosen, None, watch, words, held)
         first = prediction is None and not self._open
-        self._open, more = left_open(hypotheses, held, sifted)
-        self._open_ns, self._open_odometry = stamp_ns, self._now
-        best = self._open[0]
-        if ambiguity(self._open) <= self.options.ambiguity_ratio and (
+        hypotheses, more = left_open(hypotheses, held, sifted)
+        self._open = OpenPoses(hypotheses, stamp_ns, self._now)
+        best = hypotheses[0]
+        if ambiguity(hypotheses) <= self.options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
@@ -320,7 +317,7 @@ class Localiser:
         self._colours = alignment.colours
         self._given = None
         self._refuted_ns = None
-        self._open, self._open_odometry = (), None
+        self._open = OpenPoses()
         self._doubts = settled_doubts(self._doubts, alignment)
         shown = lines_shown(alignment)
         self._shown = shown if prior is None else self._shown | shown
@@ -341,7 +338,7 @@ class Localiser:
 
         :param more: that are not carried on.
         """
-        hypotheses = self._open
+        hypotheses = self._open.hypotheses
         poses = tuple(sorted(
             (*(Candidate(h.pose, h.mean) for h in hypotheses), *more), key=lambda c: -c.score))
         ratio = ambiguity(hypotheses)
@@ -381,9 +378,10 @@ class Localiser:
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
                     prediction.carried, doubted=doubted, times=watch.times)
         state = State.LOST if self._ever_tracked else State.SEARCHING
+        hypotheses = self._open.at(stamp_ns, self._now)
         return Estimate(
             stamp_ns, state, missing, times=watch.times, doubted=doubted,
-            candidates=tuple(Candidate(h.pose, h.mean) for h in self._open))
+            candidates=tuple(Candidate(h.pose, h.mean) for h in hypotheses))
 
     def _shaken(self, prediction: Prediction, segments: tuple[FloorSegment, ...]) -> bool:
         """Whether an image shows another place than expected, now or since the last pose."""
