@@ -24,7 +24,7 @@ from nccs_pose.estimation.judge import Found, is_expected
 from nccs_pose.estimation.ledger import Sifted
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.told import BETTER, Told
 from nccs_pose.estimation.verdict import lines_used
 
 # Of the poses among which an image does not decide so many are laid on the next; on a map with
@@ -50,7 +50,7 @@ def the_one_expected(
     if not near or _leaves_any(told, sifted):
         return None
     best, ratio = near[0], options.ambiguity_ratio
-    if best.score < ratio * held[0].score or any(
+    if best.score + BETTER < held[0].score or any(
             f.score >= ratio * best.score for f in near[1:]):
         return None
     return best

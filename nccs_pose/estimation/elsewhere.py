@@ -27,15 +27,13 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import COINCIDENT
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
-from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.told import BETTER, Told
 from nccs_pose.estimation.verdict import contradiction, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 from numpy.typing import NDArray
 
-# A pose elsewhere must beat the tracked one by this much to unseat it.
-_BETTER = 0.15
 # Lines across which a pose is laid on the next parallel one are so far apart at least, metres; of
 # those that a prediction leaves open so many are tried, the nearest first.
 _APART = 0.1
@@ -64,7 +62,7 @@ class Elsewhere:
         :param claimed: fraction of the line-coloured pixels that lie on its lines.
         """
         # No score exceeds 1.
-        return bool(alignment.missing) or min(claimed, alignment.explained) + _BETTER < 1.0
+        return bool(alignment.missing) or min(claimed, alignment.explained) + BETTER < 1.0
 
     def refused(
         self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction,
@@ -83,13 +81,13 @@ class Elsewhere:
             return Refused(against, alignment)
         vague = prediction.is_vague
         here, _ = self._searcher.score(alignment.pose, segments)
-        if not vague and here + _BETTER >= 1.0:
+        if not vague and here + BETTER >= 1.0:
             return None
         gate = min(_GATE, self._options.innovation_gate)
         told = Told(prediction.pose, prediction.covariance, gate)
         found = self._searcher.candidates(segments, told if vague else None)
         best = found.fitted[0] if found.fitted else None
-        if best is not None and best.score > here + _BETTER and not same_pose(
+        if best is not None and best.score > here + BETTER and not same_pose(
                 best.pose, alignment.pose):
             return Refused(_ANOTHER, alignment)
         if vague and (self._shows_as_much(found, alignment, here, told)

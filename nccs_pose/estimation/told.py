@@ -25,6 +25,8 @@ from nccs_pose.geometry.small_matrices import inverse
 import numpy as np
 from numpy.typing import NDArray
 
+# A pose elsewhere must score so much more than the one where the robot should be to unseat it.
+BETTER = 0.15
 # So well (m, m and rad, deviations) strips alone tell a pose.
 _GUESSED = np.diag([0.05, 0.05, 0.02])**2
 
