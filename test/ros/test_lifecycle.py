@@ -178,6 +178,11 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     user.node.create_publisher(
         Image, '/front/image', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     assert user.wait(lambda: said(f'set {reliability}')), node.output
+    # Another that it can hear cures that: the next silence has another reason.
+    images = user.publisher(Image, '/front/image')
+    images.publish(Image())
+    assert user.wait(lambda: user.count('frames_received') == 1), node.output
+    assert user.wait(lambda: said('no image came for a while')), node.output
 
 
 def test_paused_it_uses_no_image_and_says_so(world, arena):

@@ -151,6 +151,9 @@ def test_a_jump_of_the_stamps_and_relocalise_start_the_search_anew(world, arena)
     assert searched not in user.value('localiser: pose', 'reason')
     answer = user.call(Trigger, '/localiser/relocalise', Trigger.Request())
     assert answer.success, answer.message
+    # What the last image said is no news of a robot that is looked for.
+    assert user.wait(lambda: user.value('localiser: pose', 'state') == 'searching'), node.output
+    assert user.value('localiser: pose', 'reason') == 'no image yet'
     images.publish(image_message(arena[-1].stamp_ns + 10**8, 'camera', arena[-1].image))
     assert user.wait(lambda: searched in user.value('localiser: pose', 'reason')), node.output
     assert user.value('localiser: calibration', 'condition') == 'unknown'

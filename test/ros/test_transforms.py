@@ -173,6 +173,15 @@ def test_transforms_that_wait_behind_the_image_are_used_for_it(tf2: Tf2):
     assert sent.transform.translation.x == pytest.approx(-2.0)
 
 
+def test_a_time_that_no_transform_can_have_holds_up_none_after_it(tf2: Tf2):
+    out, refusals = output(tf_mode='map_to_odom')
+    out.broadcast(-5, Pose2())
+    assert refusals == ['tf_missing']
+    tf2.add('odom', 'base_link', STAMP, Pose2())
+    out.broadcast(STAMP, Pose2())
+    assert len(tf2.sent) == 1
+
+
 def test_odometry_that_is_no_rotation_is_not_passed_on(tf2: Tf2):
     out, refusals = output(tf_mode='map_to_odom')
     tf2.add('odom', 'base_link', STAMP, Pose2())
