@@ -967,6 +967,24 @@ def test_without_odometry_an_open_direction_is_not_guessed_for_long() -> None:
     assert deviations[-1] > 0.3
 
 
+def test_what_sets_an_open_direction_right_is_not_taken_for_a_velocity() -> None:
+    """Of a robot between rails that sways, without odometry; a mark shows in one image of four."""
+    rails = (_line((-30.0, -0.9), (30.0, -0.9)), _line((-30.0, 1.1), (30.0, 1.1)))
+    marks = (_line((-2.0, -0.9), (-2.0, 1.1)), _line((-2.7, -0.6), (-1.4, 0.5)))
+    marked = replace(SCENE, line_map=LineMap((*rails, *marks)))
+    drive = Drive(marked, Pose2(-1.2, 0.0, 0.05), LocaliserOptions(reach=3.0), wheels=False)
+    answers = []
+    for k in range(40):
+        shows = k < 6 or k % 4 == 0
+        drive.scene = marked if shows else replace(marked, line_map=LineMap(rails))
+        answer = drive.go(Pose2(0.035 * math.sin(0.16 * k), 0.0, 0.0))
+        if answer.pose is not None:
+            error = drive.error(answer)
+            answers.append(float(error @ np.linalg.solve(answer.covariance, error)))
+    assert len(answers) > 36
+    assert max(answers) < 25.0
+
+
 def test_a_prior_helps_where_the_lines_in_view_do_not_fix_a_pose() -> None:
     drive = Drive(
         replace(SCENE, line_map=RAILS), Pose2(8.0, 0.1, 0.05), LocaliserOptions(reach=3.0))

@@ -307,11 +307,14 @@ class Localiser:
         unobserved = unobserved_directions(
             alignment.refinement.information, alignment.pose, limit=OPEN)
         seen_ns, seen_way = stamp_ns, None if self._now is None else self._now.way
-        if unobserved and self._track is not None:
-            seen_ns, seen_way = self._track.seen_ns, self._track.seen_way
-        # No velocity leads across a jump.
-        self._past = () if self._open or self._track is None else (
-            *self._past, self._track)[-PAST:]
+        last = self._track
+        if unobserved and last is not None:
+            seen_ns, seen_way = last.seen_ns, last.seen_way
+        # No velocity leads across a jump, nor to where an image sets right what those before it
+        # had left open.
+        set_right = last is not None and last.seen_ns < last.stamp_ns and not unobserved
+        self._past = () if self._open or last is None or set_right else (
+            *self._past, last)[-PAST:]
         self._track = Track(
             stamp_ns, alignment.pose, covariance, self._now, seen_ns, seen_way)
         self._colours = alignment.colours
