@@ -481,6 +481,26 @@ def test_a_robot_that_is_followed_takes_one_pass_over_the_image(
     assert error @ np.linalg.solve(right.covariance, error) < 1.0
 
 
+@pytest.mark.parametrize('reach', [1.8, 3.0])
+def test_a_line_much_longer_than_the_reach_is_seen_as_a_shorter_one(reach: float) -> None:
+    table = FloorTable(SCENE.rig, reach)
+
+    def stations(length: float, pose: Pose2) -> list[int]:
+        x = 0.5 * length
+        crossed = LineMap((
+            _line((-x, -0.9), (x, -0.9)), _line((-x, 1.1), (x, 1.1)),
+            _line((0.3, -0.9), (0.4, 1.1))))
+        predictor = BandPredictor(table, crossed)
+        bands, _ = predictor.bands(predictor.places(pose, SPACING, 75), pose)
+        return np.bincount(bands.label, minlength=3).tolist()
+
+    for x in np.linspace(-1.0, 1.0, 5):
+        pose = Pose2(x, 0.1, 0.05)
+        short, long = stations(8.0, pose), stations(200.0, pose)
+        assert min(short[:2]) > 30
+        np.testing.assert_allclose(long, short, atol=8)
+
+
 @pytest.mark.parametrize('reach', [2.0, 5.0])
 def test_no_image_is_read_for_a_pose_that_would_rest_on_too_little(
         reach: float, monkeypatch: pytest.MonkeyPatch) -> None:

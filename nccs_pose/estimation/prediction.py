@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import itertools
 import math
 
-from nccs_pose.geometry.floor_table import as_complex, as_points, FloorTable
+from nccs_pose.geometry.floor_table import as_complex, as_points, Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.bands import Bands, in_whole_parts
@@ -30,15 +30,17 @@ from numpy.typing import NDArray
 
 # Neighbours over about so many px share what they know of the floor, the contrast and the noise.
 _SHARED_PX = 16.0
-# Coarse samples of each line, between which its image's length is interpolated.
+# Coarse samples of what is in reach of each line; between them its image is interpolated.
 _COARSE = 32
 _SLOPE = 1e-9
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
 # Floor that a profile needs beside its tape, px: nearer to another tape it would show both.
 _BESIDE = 4.0
-# So finely is known how near other tapes come, parts of a tape's length.
+# So finely is known how near other tapes come: parts of a tape's length, or more of a part that
+# would be longer than this, metres.
 _GAPS = 256
+_LONGEST_PART = 0.04
 # So many stations at most, on all lines together.
 _MOST = 1500
 _LEVEL = np.zeros(3)
@@ -85,16 +87,14 @@ class BandPredictor:
         self._direction = as_complex(line_map.directions[self._lines, :2])
         self._length = line_map.lengths[self._lines]
         self._half_width = 0.5 * line_map.widths[self._lines]
-        # Half width, half its square, length, parts (see _GAPS) per metre, the first of them and
-        # direction to the left, by rows.
+        parts = np.maximum(_GAPS, np.ceil(self._length / _LONGEST_PART)).astype(np.intp)
+        # Half width, half its square, length, parts per metre, the first of them and direction to
+        # the left, by rows.
         self._tapes = np.array([
-            self._half_width, 0.5 * self._half_width**2, self._length, _GAPS / self._length,
-            _GAPS * np.arange(len(self._lines)), -self._direction.imag, self._direction.real])
-        distance = np.linspace(0.0, 1.0, _COARSE) * self._length[:, None]
-        self._samples = (self._start[:, None] + distance * self._direction[:, None]).ravel()
-        self._distance = distance.ravel()
-        self._slope = _SLOPE * np.arange(distance.size)
-        self._gap = self._gaps().ravel()
+            self._half_width, 0.5 * self._half_width**2, self._length, parts / self._length,
+            parts.cumsum() - parts, -self._direction.imag, self._direction.real])
+        self._slope = _SLOPE * np.arange(_COARSE * len(self._lines))
+        self._gap = self._gaps(parts)
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
@@ -107,8 +107,10 @@ class BandPredictor:
         :param lines: of the map that get any; None for all.
         """
         tapes = len(self._lines)
-        pixels, seen = self._table.outline(
-            (self._samples - complex(pose.x, pose.y)) * _turned_back(pose))
+        turn = _turned_back(pose)
+        along = self._in_reach((self._start - complex(pose.x, pose.y)) * turn, turn)
+        samples = self._start[:, None] + along * self._direction[:, None]
+        pixels, seen = self._table.outline((samples.ravel() - complex(pose.x, pose.y)) * turn)
         # All lines one after the other on one axis, so that one interpolation serves them; where
         # a line is hidden, and from one to the next, its arc is flat, and a tiny slope keeps it
         # invertible.
@@ -134,7 +136,7 @@ class BandPredictor:
         number = np.arange(tapes).repeat(count)
         spacing_px, offset = np.array([apart, before]).take(number, axis=1)
         where = np.arange(0.5, len(number)) * spacing_px + offset
-        distance = np.interp(where, axis + self._slope, self._distance)
+        distance = np.interp(where, axis + self._slope, along.ravel())
         return Places(number, distance, spacing_px, members)
 
     def bands(
@@ -205,19 +207,38 @@ class BandPredictor:
             keep[at] = in_whole_parts(number.take(at), places.members)
         return bands[keep], slide[:, keep].T
 
-    def _gaps(self) -> Array:
-        """Floor between a tape's edge and the next tape (L, G), metres, along each tape."""
-        along = np.arange(0.5, _GAPS) / _GAPS
-        points = self._start[:, None] + along * (self._length * self._direction)[:, None]
+    def _in_reach(self, origin: Complex, turn: complex) -> Array:
+        """Coarse samples of each line (L, _COARSE), metres from its start, where it is in reach.
+
+        All of a line much longer than the reach would have hardly any where it is seen.
+
+        :param origin: where the lines start (L,), in base_link.
+        :param turn: from directions of the map to those of base_link.
+        """
+        to_foot = (complex(*self._table.foot) - origin) * (self._direction * turn).conj()
+        half_chord = np.sqrt(np.maximum(self._table.reach**2 - to_foot.imag**2, 0.0))
+        first = np.clip(to_foot.real - half_chord, 0.0, self._length)
+        last = np.clip(to_foot.real + half_chord, 0.0, self._length)
+        return first[:, None] + np.linspace(0.0, 1.0, _COARSE) * (last - first)[:, None]
+
+    def _gaps(self, parts: NDArray[np.intp]) -> Array:
+        """Floor between a tape's edge and the next tape, metres, along one tape after the other.
+
+        :param parts: of each tape (L,).
+        """
+        tape = np.arange(len(parts)).repeat(parts)
+        part = np.arange(len(tape)) - (parts.cumsum() - parts).repeat(parts)
+        along = (part + 0.5) * (self._length / parts).take(tape)
+        points = self._start.take(tape) + along * self._direction.take(tape)
         gaps = np.full(points.shape, np.inf)
         # One other tape at a time: all at once would fill the memory on a large map.
         for k, half_width in enumerate(self._half_width):
             seen = (points - self._start[k]) * self._direction[k].conj()
             beyond = seen.real - np.clip(seen.real, 0.0, self._length[k])
             gap = np.hypot(beyond, seen.imag) - half_width
-            gap[k] = np.inf
+            gap[tape == k] = np.inf
             np.minimum(gaps, gap, out=gaps)
-        return gaps - self._half_width[:, None]
+        return gaps - self._half_width.take(tape)
 
 
 def _turned_back(pose: Pose2) -> complex:
