@@ -144,6 +144,53 @@ def test_wheels_err_by_all_of_their_way() -> None:
         [place, place, np.hypot(0.03, 0.05 * np.sqrt(2.0 * np.pi))], rel=1e-3)
 
 
+def _begun_anew(speed: float, rate: int, silence: float, restart: Pose2) -> list[Wheels]:
+    """What wheels say before and after a silence (s), after which they leap."""
+    odometry, said = Odometry(1.0), []
+    for k in range(40 + rate):
+        pose = Pose2(speed * k / rate, 0.0, 0.0)
+        if k < 40:
+            odometry.add(k * SECOND // rate, pose)
+        elif k >= 40 + silence * rate:
+            odometry.add(k * SECOND // rate, pose @ restart)
+    for k in (39, 39 + rate):
+        wheels = odometry.at(k * SECOND // rate)
+        assert wheels is not None
+        said.append(wheels)
+    return said
+
+
+@pytest.mark.parametrize('leap', [
+    Pose2(0.7, 0.0, 0.0), Pose2(0.0, -0.4, 0.0), Pose2(0.0, 0.0, 1.5), Pose2(-1.0, 0.5, -0.6)])
+@pytest.mark.parametrize('silence', [0.1, 0.3, 0.9])
+@pytest.mark.parametrize('rate', [20, 50])
+def test_wheels_that_begin_anew_unnoticed_are_no_surer_than_they_leapt(
+        rate: int, silence: int, leap: Pose2) -> None:
+    speed = 0.35
+    before, after = _begun_anew(speed, rate, silence, leap)
+    predicted = by_odometry(START, np.zeros((3, 3)), before, after)
+    error = predicted.pose.minus(START @ Pose2(speed, 0.0, 0.0))
+    sigma = np.sqrt(np.diag(predicted.carried))
+    assert np.hypot(*error[:2]) < 2.0 * sigma[0]
+    assert abs(error[2]) < 2.0 * sigma[2]
+
+
+@pytest.mark.parametrize('rate', [10, 50, 100])
+def test_what_wheels_do_is_no_leap(rate: int) -> None:
+    """They speed up, turn, stop at once, and fall silent while they roll evenly."""
+    odometry, pose, k = Odometry(1.0), START, 0
+    speeding_up = [Twist(2.9 * j / rate, 0.0) for j in range(rate // 2)]
+    turning = [Twist(1.4, 5.0 * j / rate) for j in range(rate // 2)]
+    still, rolling = rate * [Twist(0.0, 0.0)], rate * [Twist(0.1, 0.0)]
+    for twist in (*speeding_up, *turning, *still, *rolling):
+        pose, k = integrate_twist(pose, twist, 1.0 / rate), k + 1
+        if not 3.4 * rate < k < 3.7 * rate:
+            odometry.add(k * SECOND // rate, pose)
+    wheels = odometry.at(k * SECOND // rate)
+    assert wheels is not None
+    assert wheels.leapt == (0.0, 0.0)
+
+
 def test_wheels_that_stand_and_tremble_have_not_moved() -> None:
     odometry, rng = Odometry(1.0), np.random.default_rng(3)
     for k in range(3000):

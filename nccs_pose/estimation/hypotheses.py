@@ -39,7 +39,8 @@ class Hypothesis:
 
     :ivar pose: T_map_base at the last image that was looked at.
     :ivar scores: its score in each image that it explained, 0 to 1.
-    :ivar apart: how far the robot may have gone since, unseen by any wheels, metres and rad.
+    :ivar apart: how far the robot may be from there by now, for all that wheels say of it, metres
+        and rad.
     """
 
     pose: Pose2
@@ -76,11 +77,13 @@ class OpenPoses:
         """
         if self.odometry is None or odometry is None:
             seconds = 1e-9 * (stamp_ns - self.stamp_ns)
-            way, turn = (speed * seconds for speed in SPEED)
-            return tuple(replace(h, apart=(h.apart[0] + way, h.apart[1] + turn))
-                         for h in self.hypotheses)
-        step = self.odometry.pose.inverse() @ odometry.pose
-        return tuple(replace(h, pose=h.pose @ step) for h in self.hypotheses)
+            step, (way, turn) = Pose2(0.0, 0.0, 0.0), (speed * seconds for speed in SPEED)
+        else:
+            step = self.odometry.pose.inverse() @ odometry.pose
+            way, turn = (b - a for a, b in zip(self.odometry.leapt, odometry.leapt))
+        return tuple(
+            replace(h, pose=h.pose @ step, apart=(h.apart[0] + way, h.apart[1] + turn))
+            for h in self.hypotheses)
 
 
 def confronted(

@@ -374,8 +374,9 @@ class Localiser:
         if track is not None and prediction is not None and prediction.by_odometry and not (
                 contradicted or self._shaken(prediction, segments)):
             age = (stamp_ns - track.stamp_ns) * 1e-9
-            deviation = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[:2, :2])[-1]))
-            if age <= self.options.coast_time and deviation <= self.options.coast_sigma:
+            covariance = prediction.covariance
+            variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), covariance[2, 2])
+            if age <= self.options.coast_time and variance <= self.options.coast_sigma ** 2:
                 return Estimate(
                     stamp_ns, State.COASTING,
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,

@@ -137,7 +137,8 @@ def by_odometry(
     """Carry a pose and its covariance on by what the wheels did between two moments.
 
     They err by the whole of their way, also where it leads back: by chance, whose squares add up,
-    and by their size, whose errors do.
+    and by their size, whose errors do. What they leapt may be no way at all,
+    and lead all of the way astray.
 
     :param seen_way: how far they had rolled when the pose was last fixed in every direction,
         metres; None for when they were asked first.
@@ -149,9 +150,11 @@ def by_odometry(
     faster, faster_yaw = (a * after.unheard for a in _ACCELERATION)
     open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
     scale = _SCALE * math.sqrt(distance * (distance + 2.0 * open_way))
-    sigma = math.hypot(_PER_METRE[0] * math.sqrt(distance), scale, faster)
+    leap, spin = (b - a for a, b in zip(before.leapt, after.leapt))
+    sigma = math.hypot(
+        _PER_METRE[0] * math.sqrt(distance), scale, faster, leap, spin * distance)
     sigma_yaw = math.hypot(
-        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw)
+        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin)
     return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
 
 

@@ -37,6 +37,12 @@ _DISORDERED = 3
 _FASTEST = (10.0, 20.0)
 _LONGEST_ROLL = 1.0
 _LEAP = (0.1, 0.2)
+# They stop at once, or go on about as fast as over the last so many ns: but for what wheels speed
+# up by, m/s^2 and rad/s^2, and for this, m and rad. What a sample goes beyond that may be another
+# start of odometry too; all the more after a silence, in which they may have done anything.
+_WINDOW_NS = 50_000_000
+_SPEEDING_UP = (3.0, 6.0)
+_UNEVEN = (0.05, 0.05)
 
 
 @dataclass(frozen=True)
@@ -48,12 +54,14 @@ class Wheels:
     :ivar turn: how much they have turned the robot since, rad, to and fro.
     :ivar unheard: what an acceleration of 1 m/s^2 or rad/s^2 may add, as they were not heard just
         then, metres or rad: much in a gap between two samples and past the last one.
+    :ivar leapt: how far they have gone, metres and rad, that they can hardly have rolled.
     """
 
     pose: Pose2
     way: float = 0.0
     turn: float = 0.0
     unheard: float = 0.0
+    leapt: tuple[float, float] = (0.0, 0.0)
 
 
 class Odometry:
@@ -67,8 +75,9 @@ class Odometry:
         self._clock_jump = clock_jump
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
-        # Ways and turns up to each of them, and the last pose up to which they were counted.
-        self._rolled: list[tuple[float, float]] = []
+        # Ways and turns up to each of them, and of both what they leapt; and the last pose up to
+        # which ways and turns were counted.
+        self._rolled: list[tuple[float, float, float, float]] = []
         self._counted = Pose2(0.0, 0.0, 0.0)
         self._late = 0
 
@@ -83,15 +92,18 @@ class Odometry:
         jump = self._jump(stamp_ns, pose)
         if jump:
             self.clear()
-        way, turn = self._rolled[-1] if self._rolled else (0.0, 0.0)
+        way, turn, leap, spin = self._rolled[-1] if self._rolled else (0.0, 0.0, 0.0, 0.0)
         step, turned = _apart(self._counted, pose) if self._rolled else (math.inf, math.inf)
         if step > _JITTER[0] or turned > _JITTER[1]:
             if self._rolled:
                 way, turn = way + step, turn + turned
             self._counted = pose
+        if len(self._rolled) > 1:
+            by, turned_by = self._unexplained(stamp_ns, pose)
+            leap, spin = leap + by, spin + turned_by
         self._stamps.append(stamp_ns)
         self._poses.append(pose)
-        self._rolled.append((way, turn))
+        self._rolled.append((way, turn, leap, spin))
         if len(self._stamps) > 2 * _KEPT:
             del self._stamps[:_KEPT], self._poses[:_KEPT], self._rolled[:_KEPT]
         if jump:
@@ -123,6 +135,22 @@ class Odometry:
             return f'{way:.3g} m and {turn:.3g} rad in {seconds:.3f} s are more than wheels can do'
         return ''
 
+    def _unexplained(self, stamp_ns: int, pose: Pose2) -> tuple[float, float]:
+        """How much further a sample goes than wheels do after the last, metres and rad."""
+        last_ns, last = self._stamps[-1], self._poses[-1]
+        seconds = 1e-9 * (stamp_ns - last_ns)
+        begin = max(bisect_right(self._stamps, last_ns - _WINDOW_NS) - 1, 0)
+        window = 1e-9 * (last_ns - self._stamps[begin])
+        rolled = self._poses[begin].inverse() @ last
+        share = seconds / window
+        went_on = last @ Pose2(share * rolled.x, share * rolled.y, share * rolled.yaw)
+        heard = min(seconds, 1e-9 * _LONGEST_GAP_NS)
+        way, turn = (
+            max(min(stopped, on) - 0.5 * faster * heard * (heard + window) - uneven, 0.0)
+            for stopped, on, faster, uneven in zip(
+                _apart(last, pose), _apart(went_on, pose), _SPEEDING_UP, _UNEVEN))
+        return way, turn
+
     @property
     def last_ns(self) -> int | None:
         """The stamp of the last sample; None without any."""
@@ -148,13 +176,13 @@ class Odometry:
             return None
         share = since / (t1 - t0)
         a, b = self._poses[left], self._poses[right]
-        way, turn = (u + share * (v - u) for u, v in zip(
+        way, turn, leap, spin = (u + share * (v - u) for u, v in zip(
             self._rolled[left], self._rolled[right]))
         return Wheels(
             Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y),
                   a.yaw + share * wrapped(b.yaw - a.yaw)),
             # By so much a parabola leaves the straight line through two of its points.
-            way, turn, 0.5e-18 * abs(since * until))
+            way, turn, 0.5e-18 * abs(since * until), (leap, spin))
 
 
 def _apart(a: Pose2, b: Pose2) -> tuple[float, float]:

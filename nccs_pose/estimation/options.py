@@ -87,7 +87,8 @@ class LocaliserOptions:
         doc='How long odometry alone may carry the pose on.')
     coast_sigma: float = option(
         0.25, unit='m', low=0.01, high=10.0, live=True,
-        doc='Largest standard deviation of a position carried on by odometry alone.')
+        doc='Largest standard deviation of a pose carried on by odometry alone; of its yaw as '
+            'many rad.')
     check_every: int = option(
         10, low=1, high=1000, live=True,
         doc='While tracking, every so many frames the whole image is checked for a better pose.')
