@@ -156,7 +156,7 @@ class LocaliserNode(LifecycleNode):
                 f'map_frame = {self._options.map_frame!r}, but {self._options.map_file} has '
                 f'frame: {line_map.frame}')
         self._localiser = Localiser(rig, line_map, estimator)
-        self._outputs = Outputs(self, self._options, rig, line_map, self._refuse)
+        self._outputs = Outputs(self, lambda: self._options, rig, line_map, self._refuse)
         self._keeper = PoseKeeper(self._options, line_map, self.get_logger())
         self._watch = CalibrationWatch(rig, line_map)
 

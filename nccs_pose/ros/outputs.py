@@ -44,12 +44,16 @@ class Outputs:
     """
 
     def __init__(
-        self, node: Node, options: NodeOptions, rig: Rig, line_map: LineMap,
+        self, node: Node, options: Callable[[], NodeOptions], rig: Rig, line_map: LineMap,
         refuse: Callable[[str, str], None],
     ) -> None:
-        """Create them; `refuse` hears of transforms that could not be made."""
+        """Create them.
+
+        :param options: the present ones.
+        :param refuse: called with cause and words when a transform could not be made.
+        """
         self._node = node
-        self._frame = options.map_frame
+        self._frame = options().map_frame
         self._rig = rig
         self._map = line_map
         self.transforms = TransformOutput(node, options, refuse)

@@ -47,10 +47,11 @@ class TransformOutput:
     """
 
     def __init__(
-        self, node: Node, options: NodeOptions, refuse: Callable[[str, str], None],
+        self, node: Node, options: Callable[[], NodeOptions], refuse: Callable[[str, str], None],
     ) -> None:
         """Create the broadcaster, and the listener where one is needed.
 
+        :param options: the present ones; the tolerance may change while the node runs.
         :param refuse: called with cause and words when a transform could not be made.
         """
         self._node = node
@@ -60,17 +61,18 @@ class TransformOutput:
         self._buffer: Any = None
         self._listener: Any = None
         self._broadcaster: Any = None
-        if options.tf_mode == 'none':
+        mode = options().tf_mode
+        if mode == 'none':
             return
         try:
             import tf2_ros
         except ImportError as error:
             raise OptionError(
-                f'tf_mode = {options.tf_mode} needs tf2_ros, which is not installed '
+                f'tf_mode = {mode} needs tf2_ros, which is not installed '
                 '(Ubuntu: apt install ros-jazzy-tf2-ros-py); tf_mode = none works without'
             ) from error
         self._broadcaster = tf2_ros.TransformBroadcaster(node)
-        if options.tf_mode == 'map_to_odom':
+        if mode == 'map_to_odom':
             self._buffer = tf2_ros.Buffer(node=node)
             self._listener = tf2_ros.TransformListener(self._buffer, node)
             self._not_yet = tf2_ros.TransformException
@@ -82,9 +84,10 @@ class TransformOutput:
 
     def broadcast(self, stamp_ns: int, pose: Pose2) -> None:
         """Broadcast the transform of a new estimate T_map_base, now or when it can be made."""
-        if self._options.tf_mode == 'map_to_base':
-            self._send(stamp_ns, self._options.base, pose)
-        elif self._options.tf_mode == 'map_to_odom':
+        options = self._options()
+        if options.tf_mode == 'map_to_base':
+            self._send(stamp_ns, options.base, pose)
+        elif options.tf_mode == 'map_to_odom':
             if stamp_ns < 0:
                 self._refuse('tf_missing', f'no transform is of a time before zero: {stamp_ns} ns')
                 return
@@ -97,6 +100,7 @@ class TransformOutput:
         """Try again what waits, oldest first; give up what is older than the patience."""
         if not self._pending:
             return
+        options = self._options()
         # The listener's callbacks wait behind the images, as everything else does.
         for message, _ in waiting(self._listener.tf_sub, MOST_WAITING):
             self._listener.callback(message)
@@ -104,12 +108,12 @@ class TransformOutput:
             stamp_ns, pose = self._pending[0]
             try:
                 found = self._buffer.lookup_transform(
-                    self._options.odom, self._options.base, Time(nanoseconds=stamp_ns))
+                    options.odom, options.base, Time(nanoseconds=stamp_ns))
             except self._not_yet as error:
                 if now_ns - stamp_ns <= PATIENCE_NS:
                     return
-                self._refuse('tf_missing', f'no transform {self._options.odom} -> '
-                             f'{self._options.base} at the image: {error}')
+                self._refuse('tf_missing', f'no transform {options.odom} -> {options.base} at '
+                             f'the image: {error}')
             else:
                 self._pass_on(stamp_ns, pose, found)
             self._pending.popleft()
@@ -120,7 +124,7 @@ class TransformOutput:
         except FrameRefusedError as error:
             self._refuse('tf_pose', str(error))
         else:
-            self._send(stamp_ns, self._options.odom, pose @ odom_base.inverse())
+            self._send(stamp_ns, self._options().odom, pose @ odom_base.inverse())
 
     def close(self) -> None:
         """Take back what tf2_ros has made on the node, which may be configured again."""
@@ -131,10 +135,10 @@ class TransformOutput:
             self._node.destroy_publisher(self._broadcaster.pub_tf)
 
     def _send(self, stamp_ns: int, child: str, pose: Pose2) -> None:
-        message = TransformStamped()
-        tolerance_ns = round(1e9 * self._options.transform_tolerance)
+        options, message = self._options(), TransformStamped()
+        tolerance_ns = round(1e9 * options.transform_tolerance)
         message.header.stamp = ns_to_stamp(stamp_ns + tolerance_ns)
-        message.header.frame_id = self._options.map_frame
+        message.header.frame_id = options.map_frame
         message.child_frame_id = child
         message.transform.translation.x = float(pose.x)
         message.transform.translation.y = float(pose.y)

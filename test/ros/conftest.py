@@ -75,6 +75,26 @@ def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield world
 
 
+@pytest.fixture
+def pair(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Any]:
+    """The node and a user of it in this process; `request.param` holds further parameters."""
+    rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
+    from harness import Pair
+
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=1 + os.getpid() % 99)
+    pair = Pair(context, getattr(request, 'param', {}))
+    try:
+        yield pair
+        pair.node.close()
+    finally:
+        pair.executor.shutdown()
+        rclpy.shutdown(context=context)
+
+
 @pytest.fixture(scope='session')
 def arena() -> Any:
     """Images of a short drive through the simulated arena, with their true poses."""

@@ -30,6 +30,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -39,6 +40,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 REPOSITORY = Path(__file__).resolve().parents[2]
 PATIENCE = 90.0
 """Seconds until a test gives up waiting; a loaded machine is no failure."""
+RELIABLE = {
+    'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml',
+    'qos_overrides./odom.subscription.reliability': 'reliable',
+    'qos_overrides./image.subscription.reliability': 'reliable'}
 
 
 class Process:
@@ -189,6 +194,49 @@ class User:
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
+
+
+class Pair:
+    """The node and a user of it in one process, where it is known what has arrived."""
+
+    def __init__(self, context: Context, parameters: dict[str, Any]) -> None:
+        from nccs_pose.ros.localiser_node import LocaliserNode
+
+        self.executor = SingleThreadedExecutor(context=context)
+        given = {**RELIABLE, **parameters}
+        self.node = LocaliserNode(
+            context=context, use_global_arguments=False, parameter_overrides=[
+                Parameter(name, value=value) for name, value in given.items()])
+        self.executor.add_node(self.node)
+        self.node.autostart()
+        self.user = Node('user', context=context, use_global_arguments=False)
+
+    def publisher(self, kind: type, topic: str, depth: int) -> Any:
+        publisher = self.user.create_publisher(kind, topic, QoSProfile(depth=depth))
+        self.wait(publisher.get_subscription_count)
+        return publisher
+
+    def listen(self, kind: type, topic: str) -> list[Any]:
+        """Subscribe; the list fills with messages."""
+        messages: list[Any] = []
+        if self.user not in self.executor.get_nodes():
+            self.executor.add_node(self.user)
+        subscription = self.user.create_subscription(kind, topic, messages.append, 100)
+        self.wait(subscription.get_publisher_count)
+        return messages
+
+    def set(self, **values: Any) -> None:
+        """Change parameters of the node that runs."""
+        for result in self.node.set_parameters(
+                [Parameter(name, value=value) for name, value in values.items()]):
+            assert result.successful, result.reason
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        for _ in range(1000):
+            if condition():
+                return
+            self.executor.spin_once(timeout_sec=0.02)
+        raise AssertionError('waited in vain')
 
 
 class World:

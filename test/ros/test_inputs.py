@@ -16,8 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-import os
 from typing import Any
 
 import pytest
@@ -27,61 +25,11 @@ pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 from nav_msgs.msg import Odometry
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import image_message, odometry_message
-from nccs_pose.ros.localiser_node import LocaliserNode
 import numpy as np
-import rclpy
-from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 
 SAMPLES = 60
-PARAMETERS = {
-    'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml',
-    'qos_overrides./odom.subscription.reliability': 'reliable',
-    'qos_overrides./image.subscription.reliability': 'reliable'}
-
-
-class Pair:
-    """The node and a user of it in one process, where it is known what has arrived."""
-
-    def __init__(self, context: Context, parameters: dict[str, Any]) -> None:
-        self.executor = SingleThreadedExecutor(context=context)
-        self.node = LocaliserNode(
-            context=context, use_global_arguments=False, parameter_overrides=[
-                Parameter(name, value=value) for name, value in parameters.items()])
-        self.executor.add_node(self.node)
-        self.node.autostart()
-        self.user = Node('user', context=context, use_global_arguments=False)
-
-    def publisher(self, kind: type, topic: str, depth: int) -> Any:
-        publisher = self.user.create_publisher(kind, topic, QoSProfile(depth=depth))
-        self.wait(publisher.get_subscription_count)
-        return publisher
-
-    def wait(self, condition: Callable[[], Any]) -> None:
-        for _ in range(1000):
-            if condition():
-                return
-            self.executor.spin_once(timeout_sec=0.02)
-        raise AssertionError('waited in vain')
-
-
-@pytest.fixture
-def pair(request, tmp_path, monkeypatch) -> Iterator[Pair]:
-    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
-    context = Context()
-    rclpy.init(context=context, domain_id=1 + os.getpid() % 99)
-    pair = Pair(context, {**PARAMETERS, **getattr(request, 'param', {})})
-    try:
-        yield pair
-        pair.node.close()
-    finally:
-        pair.executor.shutdown()
-        rclpy.shutdown(context=context)
 
 
 def black(number: int) -> Image:

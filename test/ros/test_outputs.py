@@ -69,7 +69,7 @@ LOST = Estimate(8, State.LOST, 'no line-like strip in the image')
 
 def made() -> tuple[Outputs, dict[str, Publisher]]:
     node = Node()
-    return Outputs(node, NodeOptions(), RIG, MAP, lambda *_: None), node.publishers
+    return Outputs(node, NodeOptions, RIG, MAP, lambda *_: None), node.publishers
 
 
 def test_nothing_is_drawn_while_nobody_subscribes(monkeypatch: pytest.MonkeyPatch):

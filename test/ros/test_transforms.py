@@ -116,7 +116,8 @@ def planar_matrix(x: float, y: float, yaw: float) -> np.ndarray:
 def output(**options: object) -> tuple[TransformOutput, list[str]]:
     refusals: list[str] = []
     return TransformOutput(
-        None, NodeOptions(**options), lambda cause, words: refusals.append(cause)), refusals
+        None, lambda: NodeOptions(**options),
+        lambda cause, words: refusals.append(cause)), refusals
 
 
 def test_map_to_odom_makes_map_to_base_the_estimate(tf2: Tf2):
@@ -214,5 +215,5 @@ def test_none_sends_nothing_and_needs_no_tf2(monkeypatch: pytest.MonkeyPatch):
 def test_what_tf2_made_on_the_node_is_taken_back(tf2: Tf2, mode: str, made: list[str]):
     node = types.SimpleNamespace(
         destroy_service=tf2.gone.append, destroy_publisher=tf2.gone.append)
-    TransformOutput(node, NodeOptions(tf_mode=mode), lambda *_: None).close()
+    TransformOutput(node, lambda: NodeOptions(tf_mode=mode), lambda *_: None).close()
     assert tf2.gone == made
