@@ -42,13 +42,14 @@ from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.pose_keeper import PoseKeeper
-from nccs_pose.ros.qos import profile
+from nccs_pose.ros.qos import overridable, profile
 from nccs_pose.ros.resources import resolve
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from std_srvs.srv import SetBool, Trigger
 
 TRANSFORM_RETRY_PERIOD = 0.02
@@ -78,8 +79,7 @@ class LocaliserNode(LifecycleNode):
         self._options = NodeOptions()
         self._settings = NodeParameters(
             self, (NodeOptions, LocaliserOptions), self._on_live_change)
-        self._diagnostics = self.create_publisher(
-            DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS))
+        self._diagnostics = self._create_diagnostics()
         self.create_service(Trigger, RELOCALISE.name, self._on_relocalise)
         self.create_service(SetBool, SET_PAUSED.name, self._on_set_paused)
         # Steady time: reports come also before the first /clock and while a bag is paused.
@@ -88,6 +88,16 @@ class LocaliserNode(LifecycleNode):
             self.get_parameter('diagnostics_period').value, self._on_period, clock=self._steady)
         self._retry_timer = self.create_timer(
             TRANSFORM_RETRY_PERIOD, self._on_retry, clock=self._steady, autostart=False)
+
+    def _create_diagnostics(self) -> Publisher:
+        try:
+            return self.create_publisher(
+                DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS),
+                qos_overriding_options=overridable())
+        except Exception as error:  # rclpy raises what the value led to
+            # Said where it can be heard: the configuration fails with it.
+            self._settings.refused[DIAGNOSTICS.name] = in_words(error)
+            return self.create_publisher(DiagnosticArray, DIAGNOSTICS.name, profile(DIAGNOSTICS))
 
     # Lifecycle
 

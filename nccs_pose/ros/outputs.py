@@ -57,11 +57,11 @@ class Outputs:
         self._rig = rig
         self._map = line_map
         self.transforms = TransformOutput(node, options, refuse)
-        self._pose = node.create_publisher(
-            PoseWithCovarianceStamped, POSE.name, profile(POSE),
-            qos_overriding_options=overridable())
-        self._debug = node.create_publisher(Image, DEBUG_IMAGE.name, profile(DEBUG_IMAGE))
-        self._markers = node.create_publisher(MarkerArray, MARKERS.name, profile(MARKERS))
+        self._pose, self._debug, self._markers = (
+            node.create_publisher(
+                kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
+            for kind, endpoint in (
+                (PoseWithCovarianceStamped, POSE), (Image, DEBUG_IMAGE), (MarkerArray, MARKERS)))
 
     def publish(
         self, estimate: Estimate, frame_id: str, image: NDArray[np.uint8], trusted: bool,

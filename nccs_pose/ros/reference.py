@@ -40,8 +40,10 @@ HEAD = """\
 Made by `python -m nccs_pose.ros.reference` from the declarations in the code; do not edit.
 
 All names are relative (to the namespace) or private (`~`, to the node) and can be remapped.
-Quality of service is overridden by the parameters
-`qos_overrides.<full topic>.<publisher or subscription>.<reliability, depth, history>`.
+The quality of service of every topic below is overridden by the parameters
+`qos_overrides.<full topic>.<publisher or subscription>.<reliability, depth, history>`, for
+example `qos_overrides./localiser/debug_image.publisher.reliability`; that of `/tf` is tf2_ros's
+own.
 """
 
 LIFECYCLE = """\

@@ -20,6 +20,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
+from nccs_pose.ros.interface import OUTPUTS
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -113,12 +114,14 @@ def test_a_parameter_of_rclpy_itself_of_another_type_is_named(world, name):
     assert 'Traceback' not in node.output
 
 
-def test_an_impossible_depth_is_named(world):
-    depth, user = 'qos_overrides./odom.subscription.depth', world.user
-    node = world.localiser('-p', f'{depth}:=-1', **ROOM)
-    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'inactive'), node.output
-    assert '/odom' in node.output
-    assert 'depth = -1: must lie in' in node.output
+@pytest.mark.parametrize(('topic', 'end', 'state'), [
+    ('/odom', 'subscription', 'inactive'), ('/diagnostics', 'publisher', 'unconfigured')])
+def test_an_impossible_depth_is_named(world, topic, end, state):
+    user = world.user
+    node = world.localiser('-p', f'qos_overrides.{topic}.{end}.depth:=-1', **ROOM)
+    assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == state), node.output
+    assert topic in node.output
+    assert 'depth = -1: must lie in' in user.value('localiser: pose', 'reason')
 
 
 def test_unknown_parameter_is_named_with_the_one_meant(world):
@@ -127,3 +130,15 @@ def test_unknown_parameter_is_named_with_the_one_meant(world):
     assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == 'active')
     assert 'parameter map_fil is unknown and has no effect; did you mean map_file?' in node.output
     assert f'parameter {misspelt} has no effect' in node.output
+
+
+@pytest.mark.parametrize('pair', [{
+    f'qos_overrides.{topic}.publisher.depth': 7
+    for topic in ('/pose', '/diagnostics', '/localiser/debug_image', '/localiser/markers')
+}], indirect=True)
+def test_every_published_topic_can_be_of_another_quality(pair, capfd):
+    ours = {p.topic_name: p.qos_profile for p in pair.node.publishers}
+    for endpoint in OUTPUTS:
+        topic = pair.node.resolve_topic_name(endpoint.name)
+        assert ours[topic].depth == 7, topic
+    assert 'has no effect' not in capfd.readouterr().err
