@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+import math
 
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.line_points import LinePoints
@@ -85,10 +86,12 @@ class Doubted:
 
 @dataclass(frozen=True)
 class Quality:
-    """Signals of health that a covariance cannot give.
+    """Signals of health that a covariance cannot give, of the pose or else the best candidate.
 
-    :ivar lines_used: map lines that the pose rests on.
-    :ivar points_used: pixels that it rests on.
+    What was not measured, as while coasting, is NaN: a zero would be the best or the worst value.
+
+    :ivar lines_used: map lines that the pose rests on; 0 where it rests on no image.
+    :ivar points_used: pixels that it rests on; 0 likewise.
     :ivar residual_px: root mean square residual, px.
     :ivar expected_px: what the noise measured in the image makes of it, px.
     :ivar explained: fraction of the predicted, visible line pixels that were found, 0 to 1.
@@ -101,11 +104,11 @@ class Quality:
 
     lines_used: int = 0
     points_used: int = 0
-    residual_px: float = 0.0
-    expected_px: float = 0.0
-    explained: float = 0.0
-    claimed: float = float('nan')
-    ambiguity: float = 0.0
+    residual_px: float = math.nan
+    expected_px: float = math.nan
+    explained: float = math.nan
+    claimed: float = math.nan
+    ambiguity: float = math.nan
     unobserved: tuple[str, ...] = ()
 
 

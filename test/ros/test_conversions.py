@@ -266,6 +266,15 @@ def test_a_pose_of_images_that_no_longer_come_is_no_good_news() -> None:
         assert silence in shown.message
 
 
+def test_what_no_image_has_measured_is_no_number() -> None:
+    coasting = Estimate(5, State.COASTING, 'carried on', Pose2(1.0, 2.0, 3.0), np.eye(3))
+    shown = pose_status('n', 'active', '', '', coasting, 0.1, 0.02)
+    values = {entry.key: entry.value for entry in shown.values}
+    for key in ('residual_px', 'expected_px', 'explained', 'claimed', 'ambiguity'):
+        assert values[key] == 'nan', key
+    assert (values['lines_used'], values['points_used']) == ('0', '0')
+
+
 def test_a_prefix_of_frames_has_no_leading_slash() -> None:
     assert NodeOptions(frame_prefix='robot/').odom == 'robot/odom'
     with pytest.raises(OptionError, match='frame_prefix'):
