@@ -30,6 +30,7 @@ from nccs_pose.files.image_folder import image_files, read_images
 from nccs_pose.files.pictures import save_figure, save_image
 from nccs_pose.files.trajectories import read_tum
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.simulation.scene import arena_map, arena_rig
 from nccs_pose.vision.line_points import LinePoints
 import numpy as np
 import pytest
@@ -98,17 +99,54 @@ def test_an_overlay_draws_points_where_they_were_found(ray_traced: Path, scale: 
     estimate = Estimate(0, State.LOST, 'kidnapped – 3σ', points=points, quality=Quality(
         unobserved=('along x',)))
     overlay = draw_overlay(image, rig, line_map, estimate, scale=scale)
-    assert overlay.shape == (960 * scale, 1280 * scale, 3)
+    assert overlay.shape[1:] == (1280 * scale, 3)
     np.testing.assert_array_equal(image, before)
-    changed = np.argwhere(np.any(overlay != 90, axis=2))[:, ::-1] / scale
-    below_panel = changed[changed[:, 1] > 200.0]
-    distance = np.linalg.norm(below_panel[:, None] - points.pixels, axis=2)
+    drawn = np.argwhere(np.any(overlay[:960 * scale] != 90, axis=2))[:, ::-1] / scale
+    distance = np.linalg.norm(drawn[:, None] - points.pixels, axis=2)
     assert distance.min(axis=1).max() < 3.5  # nothing else is drawn without a pose
     assert (distance.min(axis=0) < 1.0).all()
     with_pose = Estimate(
         0, State.TRACKING, 'explained', Pose2(0.1, 0.2, 0.3), np.diag([1e-6, 1e-6, 1e-6]))
     drawn = draw_overlay(image, rig, line_map, with_pose, truth=Pose2(), scale=scale)
-    assert np.count_nonzero(np.any(drawn != 90, axis=2)) > 1500
+    assert np.count_nonzero(np.any(drawn[:960 * scale] != 90, axis=2)) > 1500
+    assert drawn.shape == overlay.shape
+
+
+@pytest.mark.parametrize('width', [320, 640, 1280])
+def test_an_overlay_writes_below_the_image_and_within_its_width(
+        width: int) -> None:
+    image = np.full((96, width, 3), 90, np.uint8)
+    shapes = set()
+    for reason in ('lost', 'the second scores 0.93 of the first; ' * 9):
+        for pose in (None, Pose2(0.1, 0.2, 0.3)):
+            estimate = Estimate(0, State.SEARCHING, reason, pose, pose and 1e-4 * np.eye(3))
+            overlay = draw_overlay(image, arena_rig(), arena_map(), estimate)
+            shapes.add(overlay.shape)
+            if pose is None:  # else the lines are drawn
+                np.testing.assert_array_equal(overlay[:96], image)
+            strip = overlay[96:].astype(int)
+            assert np.ptp(strip) > 100  # it is written on
+            assert np.ptp(strip[:, :3]) == np.ptp(strip[:, -3:]) == 0
+    assert len(shapes) == 1
+
+
+def test_an_overlay_leaves_out_what_was_not_measured(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    monkeypatch.setattr(cv2, 'putText', lambda canvas, text, *_: written.append(text))
+
+    def words(quality: Quality) -> str:
+        written.clear()
+        draw_overlay(np.zeros((960, 1280, 3), np.uint8), arena_rig(), arena_map(), Estimate(
+            0, State.COASTING, 'carried on', Pose2(), 1e-4 * np.eye(3), quality=quality))
+        return '\n'.join(written)
+
+    coasting = words(Quality())
+    for word in ('points ', 'residual', 'explained', 'nan'):
+        assert word not in coasting
+    assert '3 lines   70 points   residual 0.31 px   explained 90 %' in words(
+        Quality(3, 70, 0.31, 0.3, 0.9))
+    assert '3 lines   70 points\n' in words(Quality(3, 70))
 
 
 def test_the_error_figure_shows_the_errors_and_their_band() -> None:

@@ -33,15 +33,19 @@ _UNLABELLED = (200, 200, 200)
 _STATE_COLOURS = {
     State.SEARCHING: (200, 200, 200), State.AMBIGUOUS: (60, 200, 255),
     State.TRACKING: (120, 230, 120), State.COASTING: (60, 200, 255), State.LOST: (90, 90, 255)}
+KEY = 'dots: pixels that the pose rests on   curves: line edges as predicted'
+_ROWS = 6
+"""Of text, always: pictures of one stream are of one size. Two are left for a long reason."""
+_STRIP = 24  # grey level
 _SAMPLES = 240
 _SHIFT = 4  # OpenCV draws in sixteenths of a pixel
 
 
 def draw_overlay(
     image: Image, rig: Rig, line_map: LineMap, estimate: Estimate, truth: Pose2 | None = None,
-    scale: int = 1,
+    scale: int = 1, key: str = KEY,
 ) -> Image:
-    """Draw an estimate over its image.
+    """Draw an estimate over its image, and write what it says in a strip below.
 
     Points are the pixels that the pose rests on, one colour a line; the thin curves are both
     edges of every line as the rig would show them from the estimated pose.
@@ -49,7 +53,8 @@ def draw_overlay(
     :param image: BGR (H, W, 3) uint8; it is left as it is.
     :param truth: the true pose, if known; its error is written.
     :param scale: how many times larger to draw, so that what is thin can be seen.
-    :returns: BGR (scale H, scale W, 3) uint8.
+    :param key: what the marks mean, for the last row.
+    :returns: BGR (scale H + strip, scale W, 3) uint8; pixels are where they are in the image.
     """
     canvas = np.ascontiguousarray(image).copy()
     if scale > 1:
@@ -62,8 +67,8 @@ def draw_overlay(
                        cv2.LINE_AA, _SHIFT)
     if estimate.pose is not None:
         _draw_prediction(canvas, rig, line_map, estimate.pose, scale)
-    _draw_panel(canvas, _words(estimate, truth), _STATE_COLOURS[estimate.state])
-    return canvas
+    strip = _strip(canvas, _words(estimate, truth), key, _STATE_COLOURS[estimate.state])
+    return np.vstack([canvas, strip])
 
 
 def predicted_curves(rig: Rig, points_map: Array, pose: Pose2) -> list[Array]:
@@ -101,37 +106,63 @@ def _draw_prediction(
 
 def _words(estimate: Estimate, truth: Pose2 | None) -> list[str]:
     words = [f'{estimate.state.value.upper()}: {estimate.reason}']
+    measured: list[str] = []
     pose, quality = estimate.pose, estimate.quality
     if pose is not None:
-        words.append(
-            f'x {pose.x:+.4f} m   y {pose.y:+.4f} m   yaw {math.degrees(pose.yaw):+.3f} deg')
+        row = f'x {pose.x:+.4f} m   y {pose.y:+.4f} m   yaw {math.degrees(pose.yaw):+.3f} deg'
         if estimate.covariance is not None:
             x, y, yaw = np.sqrt(np.diag(estimate.covariance))
-            words.append(
-                f'sigma {1e3 * x:.2f} mm   {1e3 * y:.2f} mm   {math.degrees(yaw):.4f} deg')
+            row += (f'   sigma {1e3 * x:.2f} mm, {1e3 * y:.2f} mm, '
+                    f'{math.degrees(yaw):.4f} deg')
+        words.append(row)
         if truth is not None:
             distance = 1e3 * math.hypot(pose.x - truth.x, pose.y - truth.y)
             turn = math.degrees(abs(Pose2(yaw=pose.yaw - truth.yaw).yaw))
-            words.append(f'error {distance:.2f} mm   {turn:.4f} deg')
-    words.append(
-        f'{quality.lines_used} lines   {quality.points_used} points   '
-        f'residual {quality.residual_px:.2f} px   explained {100 * quality.explained:.0f} %')
+            measured.append(f'error {distance:.2f} mm, {turn:.4f} deg')
+    # What was not measured is left out.
+    if quality.points_used:
+        measured += [f'{quality.lines_used} lines', f'{quality.points_used} points']
+    if math.isfinite(quality.residual_px):
+        measured.append(f'residual {quality.residual_px:.2f} px')
+    if math.isfinite(quality.explained):
+        measured.append(f'explained {100 * quality.explained:.0f} %')
+    if measured:
+        words.append('   '.join(measured))
     if quality.unobserved:
         words.append(f'not observed: {", ".join(quality.unobserved)}')
     return words
 
 
-def _draw_panel(canvas: Image, words: list[str], accent: tuple[int, int, int]) -> None:
-    """Write on a darkened corner, the first line in the state's colour."""
+def _strip(canvas: Image, words: list[str], key: str, accent: tuple[int, int, int]) -> Image:
+    """Words on a dark strip as wide as the canvas: the first in the state's colour, then the key.
+
+    Below the image it hides no line.
+    """
     scale = _text_scale(canvas)
-    step = round(38 * scale)
-    widest = max(
-        cv2.getTextSize(_ascii(text), cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] for text in words)
-    corner = canvas[:step * len(words) + step // 2, :widest + step]
-    corner[:] = (0.3 * corner).astype(np.uint8)
-    for row, text in enumerate(words):
-        _put_text(canvas, text, (step // 2, step * (row + 1)),
-                  accent if row == 0 else (255, 255, 255), scale)
+    step, width = round(38 * scale), canvas.shape[1]
+    strip = np.full((step * _ROWS + step // 2, width, 3), _STRIP, np.uint8)
+    rows = [
+        (row, accent if number == 0 else (255, 255, 255))
+        for number, text in enumerate(words) for row in _wrapped(text, width - step, scale)]
+    last = [(row, _UNLABELLED) for row in _wrapped(key, width - step, scale)][:_ROWS - 1]
+    room = _ROWS - len(last)
+    # What does not fit is of the least use: the end.
+    placed = [*enumerate(rows[:room], 1), *enumerate(last, room + 1)]
+    for number, (row, colour) in placed:
+        _put_text(strip, row, (step // 2, step * number), colour, scale)
+    return strip
+
+
+def _wrapped(text: str, width: int, scale: float) -> list[str]:
+    """A text in rows of no more than so many pixels, unless a single word is longer."""
+    rows = ['']
+    for word in _ascii(text).split(' '):
+        longer = f'{rows[-1]} {word}' if rows[-1] else word
+        if cv2.getTextSize(longer, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] <= width:
+            rows[-1] = longer
+        else:
+            rows.append(word)
+    return rows
 
 
 def _put_text(

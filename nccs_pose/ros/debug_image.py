@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.evaluation.overlay import draw_overlay
+from nccs_pose.evaluation.overlay import draw_overlay, KEY
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.vision.segment import chromatic_mask, hsv_mask
@@ -33,7 +33,7 @@ def draw_debug_image(
     image: NDArray[np.uint8], rig: Rig, line_map: LineMap, estimate: Estimate,
     options: LocaliserOptions,
 ) -> NDArray[np.uint8]:
-    """Draw over an image (H, W, 3); pixels that count as line-coloured are tinted cyan."""
+    """Draw over an image (H, W, 3), and write below; line-coloured pixels are tinted cyan."""
     tinted = image.copy()
     for colour in dict.fromkeys(line.colour for line in line_map):
         if options.threshold == 'hsv':
@@ -43,4 +43,5 @@ def draw_debug_image(
                 image, colour, options.noise_gate, options.least_contrast, options.window)
         chosen = mask > 0
         tinted[chosen] = tinted[chosen] // 2 + MASK_COLOUR // 2
-    return draw_overlay(tinted, rig, line_map, estimate)
+    return draw_overlay(
+        tinted, rig, line_map, estimate, key=f'cyan: counts as line-coloured   {KEY}')

@@ -68,7 +68,10 @@ DIAGNOSTICS = Endpoint(
     'the state.')
 DEBUG_IMAGE = Endpoint(
     '~/debug_image', 'sensor_msgs/msg/Image',
-    'What was detected and what was predicted; drawn only while somebody subscribes.', True, 1)
+    'The image, with what was detected and what was predicted: cyan are the pixels that count as '
+    'line-coloured, dots the pixels that the pose rests on (one colour a line), thin curves the '
+    'edges of the lines as the pose predicts them. Below it stand the state and the numbers, so '
+    'that it is higher than the image. Drawn only while somebody subscribes.', True, 1)
 MARKERS = Endpoint(
     '~/markers', 'visualization_msgs/msg/MarkerArray',
     'Map lines, observed points and pose ellipse for RViz; only while somebody subscribes.',
