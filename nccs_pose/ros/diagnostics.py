@@ -20,6 +20,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 import math
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nccs_pose.estimation.estimate import Estimate, State
 
@@ -181,7 +182,7 @@ def time_status(node: str, estimate: Estimate | None, decode: float, latency: fl
         f'{node}: time', DiagnosticStatus.OK, f'{1e3 * latency:.1f} ms an image', values)
 
 
-def diagnostic_array(stamp, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
+def diagnostic_array(stamp: Time, statuses: list[DiagnosticStatus]) -> DiagnosticArray:
     """The message; stamped with the node's clock, for it speaks of now."""
     message = DiagnosticArray(status=statuses)
     message.header.stamp = stamp

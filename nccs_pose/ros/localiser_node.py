@@ -20,6 +20,7 @@ parts are wired to the lifecycle.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import gc
 import math
 import time
@@ -109,11 +110,11 @@ class LocaliserNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check rig, map and parameters."""
-        return self._attempt('configuration', self._configure)
+        return self._attempt('configuration', self._configure, self._clean_up)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start to listen."""
-        return self._attempt('activation', self._activate)
+        return self._attempt('activation', self._activate, self._deactivate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; the last good pose is saved."""
@@ -125,8 +126,7 @@ class LocaliserNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop and forget everything."""
-        self._attempt('shutdown', self._deactivate)
-        return self._attempt('shutdown', self._clean_up)
+        return self._attempt('shutdown', self._shut_down)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Return to unconfigured, from where it can be tried again."""
@@ -134,25 +134,22 @@ class LocaliserNode(LifecycleNode):
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
-    def _attempt(self, what: str, step: Any) -> TransitionCallbackReturn:
+    def _attempt(
+        self, what: str, step: Callable[[], None], undo: Callable[[], None] | None = None,
+    ) -> TransitionCallbackReturn:
+        """Take a step, or say why not; `undo` leaves nothing half made behind one that failed."""
         try:
             step()
         except Exception as error:
             words = str(error) if isinstance(error, NccsPoseError) else in_words(error)
             self._configuration_problem = f'{what} failed: {words}'
             self.get_logger().error(self._configuration_problem)
-            self._clean_up_after(what)
+            if undo is not None:
+                undo()
             return TransitionCallbackReturn.FAILURE
         self._configuration_problem = ''
         self.get_logger().info(f'{what} done')
         return TransitionCallbackReturn.SUCCESS
-
-    def _clean_up_after(self, what: str) -> None:
-        """Leave nothing half made behind a transition that failed."""
-        if what == 'activation':
-            self._deactivate()
-        elif what == 'configuration':
-            self._clean_up()
 
     def _configure(self) -> None:
         self._options, estimator = self._settings.options()
@@ -200,7 +197,14 @@ class LocaliserNode(LifecycleNode):
     def _clean_up(self) -> None:
         if self._outputs is not None:
             self._outputs.close()
-        self._outputs = self._localiser = self._keeper = self._estimate = self._watch = None
+        self._outputs = self._localiser = self._keeper = self._watch = self._rig = None
+        self._estimate = self._pose_stamp_ns = None
+
+    def _shut_down(self) -> None:
+        try:
+            self._deactivate()
+        finally:
+            self._clean_up()
 
     # Input
 

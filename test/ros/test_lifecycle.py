@@ -25,6 +25,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nccs_pose.ros.conversions import image_message
@@ -68,6 +69,44 @@ def test_full_cycle_and_transitions_that_are_not_allowed(world):
     assert state(user) == State.PRIMARY_STATE_FINALIZED
     assert not change(user, Transition.TRANSITION_CONFIGURE)
     assert node.stop(signal.SIGINT) == 0, node.output
+
+
+def age(reports) -> str:
+    """Age of the last pose in the last report."""
+    values = reports[-1].status[0].values if reports else ()
+    return next((v.value for v in values if v.key == 'age_s'), '')
+
+
+@pytest.mark.parametrize('pair', [{'diagnostics_period': 0.05}], indirect=True)
+def test_what_is_forgotten_has_no_age(pair, arena):
+    reports, images = pair.listen(DiagnosticArray, '/diagnostics'), pair.publisher(
+        Image, 'image', 1)
+    images.publish(image_message(arena[0].stamp_ns, 'camera', arena[0].image))
+    pair.wait(lambda: pair.node._tally.answered)
+    pair.wait(lambda: age(reports) not in ('', 'nan'))
+    pair.node.trigger_deactivate()
+    pair.node.trigger_cleanup()
+    pair.wait(lambda: age(reports) == 'nan')
+
+
+@pytest.mark.parametrize('pair', [{'diagnostics_period': 0.05}], indirect=True)
+def test_a_shutdown_that_fails_says_so_and_forgets_everything_all_the_same(
+        pair, monkeypatch, capfd):
+    def full() -> None:
+        raise OSError('the disk is full')
+
+    reports = pair.listen(DiagnosticArray, '/diagnostics')
+    monkeypatch.setattr(pair.node._keeper, 'save', full)
+    pair.node.trigger_shutdown()
+    pair.wait(lambda: reports
+              and reports[-1].status[0].message == 'shutdown failed: OSError: the disk is full')
+    assert pair.node._outputs is None
+    assert 'shutdown done' not in capfd.readouterr().err
+
+
+def test_a_shutdown_is_said_once(pair, capfd):
+    pair.node.trigger_shutdown()
+    assert capfd.readouterr().err.count('shutdown done') == 1
 
 
 BAD_CONFIGURATIONS = [
