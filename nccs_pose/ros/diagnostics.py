@@ -135,6 +135,14 @@ def pose_status(
     return status(name, LEVELS[estimate.state], words, values)
 
 
+def warned(pose: DiagnosticStatus, words: str) -> DiagnosticStatus:
+    """A status that says further words, and is no good news if there are any."""
+    if words:
+        pose.level = max(pose.level, DiagnosticStatus.WARN)
+        pose.message = f'{pose.message}; {words}'
+    return pose
+
+
 def image_status(
     node: str, topic: str, publishers: int, tally: Tally, problem: str, fresh_refusals: int,
     fresh_lost: int,

@@ -316,8 +316,12 @@ class LocaliserNode(LifecycleNode):
         name, tally = self.get_fully_qualified_name().lstrip('/'), self._tally
         silence = '' if self._stream is None else self._stream.problem(
             self._options.silence_warning)
-        statuses = [diagnostics.pose_status(
-            name, label, self._problem(), silence, self._estimate, age, self._odometry_lag())]
+        others = '' if self._outputs is None else self._outputs.others()
+        if others:
+            self.get_logger().warning(others, throttle_duration_sec=60.0)
+        statuses = [diagnostics.warned(diagnostics.pose_status(
+            name, label, self._problem(), silence, self._estimate, age, self._odometry_lag()),
+            others)]
         if self._stream is not None:
             troubles = sum(tally.refused.values()) + sum(tally.errors.values())
             statuses += [

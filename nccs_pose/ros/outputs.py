@@ -87,6 +87,15 @@ class Outputs:
             self._markers.publish(marker_array(self._frame, estimate, self._rig, self._map))
         return given
 
+    def others(self) -> str:
+        """Who else publishes the pose, in words; empty if nobody does."""
+        topic = self._pose.topic_name
+        number = self._node.count_publishers(topic) - 1
+        if number <= 0:
+            return ''
+        return (f'{topic} has {number} other publisher{"s" if number > 1 else ""}: its '
+                'subscribers get poses of both. Is the node started twice?')
+
     def close(self) -> None:
         """Destroy the publishers."""
         self.transforms.close()

@@ -26,6 +26,7 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nccs_pose.ros.conversions import image_message
@@ -222,6 +223,26 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     images.publish(Image())
     assert user.wait(lambda: user.count('frames_received') == 1), node.output
     assert user.wait(lambda: said('no image came for a while')), node.output
+
+
+@pytest.mark.parametrize('pair', [{'diagnostics_period': 0.05}], indirect=True)
+def test_another_publisher_of_the_pose_is_noticed(pair, capfd):
+    reports = pair.listen(DiagnosticArray, '/diagnostics')
+
+    def warned() -> bool:
+        """Whether the last report says it."""
+        status = reports[-1].status[0]
+        return '/pose has 1 other publisher:' in status.message and status.level > b'\0'
+
+    pair.wait(lambda: reports)
+    assert not warned()
+    other = pair.user.create_publisher(PoseWithCovarianceStamped, 'pose', 1)
+    pair.wait(warned)
+    said = len(reports)
+    pair.wait(lambda: len(reports) > said + 3)
+    assert capfd.readouterr().err.count('/pose has 1 other publisher') == 1
+    pair.user.destroy_publisher(other)
+    pair.wait(lambda: not warned())
 
 
 def test_paused_it_uses_no_image_and_says_so(world, arena):
