@@ -21,7 +21,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from nccs_pose.errors import FrameRefusedError, NccsPoseError
+from nccs_pose.errors import FrameRefusedError
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.ros.camera_check import contradiction
@@ -39,7 +39,7 @@ Refuse = Callable[[str, str], None]
 
 
 class Inputs:
-    """Subscribes them.
+    """Subscribes camera_info, odom and initialpose, and hands on what can be used.
 
     The messages are taken as bytes and decoded here: rclpy drops what it cannot decode without
     a word, here it is counted.
@@ -96,8 +96,6 @@ class Inputs:
                 use(message)
             except FrameRefusedError as error:
                 self._refuse(error.cause, str(error))
-            except NccsPoseError as error:
-                self._refuse(f'{endpoint.name}_data', str(error))
 
         return self._node.create_subscription(
             kind, endpoint.name, receive, profile(endpoint), raw=True,

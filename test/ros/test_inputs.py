@@ -16,17 +16,22 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
+from harness import REPOSITORY
 from nav_msgs.msg import Odometry
+from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import image_message, odometry_message
+from nccs_pose.ros.interface import CAUSES
 import numpy as np
 from rclpy.duration import Duration
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 SAMPLES = 60
@@ -61,6 +66,33 @@ def test_odometry_that_arrived_before_an_image_is_used_before_it(pair, monkeypat
     pair.wait(lambda: before_image)
     assert before_image == [SAMPLES]
     assert seen == [1 + k * 10_000_000 for k in range(SAMPLES)]
+
+
+def test_every_cause_of_a_refusal_is_in_the_reference():
+    said = {cause for names, _ in CAUSES for cause in re.findall('`([a-z_]+)`', names)}
+    literal = re.compile(r"(?:FrameRefusedError|refuse)\(\s*(f?)'([^']+)'")
+    of_a_topic = re.compile(r'\{what\}_(\w+)')
+    found = [match.groups() for path in (REPOSITORY / 'nccs_pose').rglob('*.py')
+             for match in literal.finditer(path.read_text())]
+    assert len(found) > 12
+    for is_format, cause in found:
+        if is_format:
+            kind = of_a_topic.fullmatch(cause)
+            assert kind, cause
+            assert f'initialpose_{kind[1]}' in said
+        else:
+            assert cause in said
+
+
+def test_an_error_that_is_nobodys_fault_outside_is_no_refusal(pair, monkeypatch):
+    def fail(*_: object) -> None:
+        raise GeometryError('a mistake of our own')
+
+    monkeypatch.setattr(pair.node._localiser, 'add_odometry', fail)
+    odometry = odometry_message(1, 'odom', 'base_link', Pose2(), 0.0, 0.0)
+    with pytest.raises(GeometryError):
+        pair.node._inputs._odometry.callback(serialize_message(odometry))
+    assert not pair.node._tally.refused
 
 
 def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
