@@ -40,6 +40,8 @@ IMMOVABLE_VARIANCE = 1e-6
 """Variance of z, roll and pitch, which a planar robot cannot change: m^2, rad^2."""
 FARTHEST = 1e8
 """Metres: further from its origin no frame of the earth is, and sums of squares overflow."""
+MOST_TILTED = math.radians(30.0)
+"""No ramp is steeper; where z points down, as in some frames of the sea, a yaw turns backwards."""
 PLANAR = (0, 1, 5)
 """Rows of x, y and yaw in a 6 x 6 covariance (x, y, z, roll, pitch, yaw)."""
 
@@ -86,7 +88,7 @@ def pose_to_planar(pose: Pose, what: str) -> Pose2:
     """The planar part of a pose.
 
     :raises FrameRefusedError: cause `<what>_pose`, if a number is not finite or beyond the earth,
-        or the quaternion is none.
+        the quaternion is none, or z does not point up.
     """
     p, q = pose.position, pose.orientation
     values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
@@ -103,6 +105,11 @@ def pose_to_planar(pose: Pose, what: str) -> Pose2:
         raise FrameRefusedError(
             f'{what}_pose', f'{what}: the quaternion ({q.x}, {q.y}, {q.z}, {q.w}) has length '
             f'{norm:.3g}, not 1')
+    tilt = 2.0 * math.atan2(math.hypot(q.x, q.y), math.hypot(q.z, q.w))
+    if tilt > MOST_TILTED:
+        raise FrameRefusedError(
+            f'{what}_pose', f'{what}: tilted by {math.degrees(tilt):.0f} deg, more than '
+            f'{math.degrees(MOST_TILTED):.0f}: the robot stands on the floor')
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), norm * norm - 2.0 * (q.y * q.y + q.z * q.z))
     return Pose2(p.x, p.y, yaw)
 

@@ -122,12 +122,13 @@ CAUSES = (
     ('`undecodable`', 'bytes that are no message of the topic (of images the middleware hands on '
      'none: they count as frames_dropped_busy)'),
     ('`odom_frame`, `odom_pose`', 'odometry of other frames; with a number that is not finite or '
-     'beyond 1e8 m, or no rotation'),
+     'beyond 1e8 m, no rotation, or one that tilts by more than 30 deg'),
     ('`odom_jump`', 'odometry that leaps further than wheels roll (10 m/s, 20 rad/s), or back in '
      'time by more than `clock_jump`: it begins anew, and carries no pose across'),
     ('`initialpose_frame`, `initialpose_pose`, `initialpose_covariance`',
-     'an initial pose in another frame; not finite or no rotation; whose covariance is none'),
+     'an initial pose in another frame; of which the same holds as of odometry; whose covariance '
+     'is none'),
     ('`tf_missing`, `tf_pose`', 'an estimate whose odometry transform did not come within 1 s; a '
-     'transform that is none'),
+     'transform of which the same holds'),
 )
 """Words by which refused messages are counted."""

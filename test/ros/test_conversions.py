@@ -79,6 +79,20 @@ def test_yaw_of_a_tilted_pose(yaw: float, pitch: float, roll: float):
     assert math.cos(c.pose_to_planar(message, 'odom').yaw - yaw) == pytest.approx(1.0, abs=1e-9)
 
 
+@given(angles, angles, st.floats(-math.pi, math.pi))
+def test_a_robot_on_its_side_is_refused(yaw: float, axis: float, tilt: float):
+    lean = Rotation.from_rotvec([tilt * math.cos(axis), tilt * math.sin(axis), 0.0])
+    x, y, z, w = (Rotation.from_euler('z', yaw) * lean).as_quat()
+    message = Pose()
+    message.orientation.x, message.orientation.y = float(x), float(y)
+    message.orientation.z, message.orientation.w = float(z), float(w)
+    if abs(tilt) < math.radians(29.9):
+        c.pose_to_planar(message, 'odom')
+    elif abs(tilt) > math.radians(30.1):
+        with pytest.raises(FrameRefusedError, match='odom: tilted by'):
+            c.pose_to_planar(message, 'odom')
+
+
 def test_covariance_lies_where_rep_103_says():
     covariance = np.array([[4.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 2.0]])
     message = over_the_wire(c.pose_message(7, 'map', Pose2(1.0, 2.0, 0.3), covariance))
