@@ -75,7 +75,8 @@ def test_stand_in_camera_is_localised_live(world, transport):
         assert pose.header.frame_id == 'map'
         assert np.linalg.eigvalsh(pose.pose.covariance.reshape(6, 6))[0] > 0.0
     assert infos[0].header.frame_id == 'camera_optical'
-    assert decode(debug[-1]).shape == (480, 640, 3)
+    assert decode(debug[-1]).shape[1:] == (640, 3)
+    assert debug[-1].height > 480  # words below the image
     assert {m.header.frame_id for m in markers[-1].markers} == {'map'}
     assert user.value('localiser: pose', 'state') == 'tracking'
     assert user.count('refused') == user.count('errors') == 0
