@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib.util
 from pathlib import Path
 import re
@@ -29,7 +30,8 @@ import xml.etree.ElementTree as ElementTree
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros import reference
-from nccs_pose.ros.interface import INPUTS, OUTPUTS
+from nccs_pose.ros.camera_options import CameraOptions
+from nccs_pose.ros.interface import INPUTS, OUTPUTS, STAND_IN_OUTPUTS
 from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.simulation.scene import arena_rig
@@ -113,6 +115,20 @@ def test_package_xml_names_every_ros_package_that_is_imported(repository: Path):
 def test_reference_page_is_up_to_date(repository: Path):
     page = (repository / 'docs/reference.md').read_text()
     assert page == reference.page(), 'run: python -m nccs_pose.ros.reference'
+
+
+def test_reference_page_has_the_stand_in_camera_and_the_launch_files(repository: Path):
+    _, _, page = reference.page().partition('## The node `stand_in_camera`')
+    for field in dataclasses.fields(CameraOptions):
+        assert f'| `{field.name}` |' in page
+    camera, *files = page.split('\n### ')
+    for endpoint in STAND_IN_OUTPUTS:
+        assert f'| `{endpoint.name}` | `{endpoint.type}` |' in camera
+    shipped = sorted((repository / 'launch').glob('*.launch.py'))
+    assert [text.partition('\n')[0] for text in files] == [f'`{f.name}`' for f in shipped]
+    for text, file in zip(files, shipped):
+        declared = re.findall(r"DeclareLaunchArgument\(\s*'(\w+)'", file.read_text())
+        assert re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE) == declared
 
 
 @pytest.mark.parametrize('name', PARAMETER_FILES)
@@ -229,10 +245,7 @@ def test_launch_file_names_only_what_exists(
             assert {source for source, _ in node.named.get('remappings', [])} <= inputs
             check_parameters(node.named['parameters'], NodeOptions)
     if name == 'synthetic_robot':
-        pytest.importorskip('rclpy', reason='needs rclpy')
-        from nccs_pose.ros import stand_in_camera as stand_in
-
-        check_parameters(nodes[0].named['parameters'], stand_in.CameraOptions)
+        check_parameters(nodes[0].named['parameters'], CameraOptions)
 
 
 def check_parameters(parameters: list[Any], group: type) -> None:

@@ -84,6 +84,22 @@ SET_PAUSED = Endpoint(
     '~/set_paused', 'std_srvs/srv/SetBool', 'Stop (true) or resume (false) using images.')
 SERVICES = (RELOCALISE, SET_PAUSED)
 
+STAND_IN_IMAGE = Endpoint(
+    'image', 'sensor_msgs/msg/Image', 'Rendered images, when image_transport is raw.', True, 2)
+STAND_IN_IMAGE_COMPRESSED = Endpoint(
+    'image/compressed', 'sensor_msgs/msg/CompressedImage',
+    'Rendered images as JPEG, when image_transport is compressed.', True, 2)
+STAND_IN_INFO = Endpoint(
+    'camera_info', 'sensor_msgs/msg/CameraInfo', "The rig's camera, with every image.", True, 2)
+STAND_IN_ODOM = Endpoint(
+    'odom', 'nav_msgs/msg/Odometry', 'Odometry of wheels that are a little wrong.', True, 100)
+STAND_IN_TRUTH = Endpoint(
+    'ground_truth/pose', 'geometry_msgs/msg/PoseStamped',
+    "The true pose in the map frame, at every image's stamp.", True, 100)
+STAND_IN_OUTPUTS = (
+    STAND_IN_IMAGE, STAND_IN_IMAGE_COMPRESSED, STAND_IN_INFO, STAND_IN_ODOM, STAND_IN_TRUTH)
+"""What the stand-in camera publishes; reliable, so that every subscriber hears it."""
+
 TF_MODES = (
     ('`none`', 'anything', 'nothing'),
     ('`map_to_odom`', 'odom -> base_link',
@@ -91,25 +107,6 @@ TF_MODES = (
     ('`map_to_base`', 'nothing above base_link', 'map -> base_link'),
 )
 """tf_mode, and who broadcasts what."""
-
-STATUSES = (
-    ('`localiser: pose`',
-     'lifecycle, state (`searching`, `ambiguous`, `tracking`, `coasting`, `lost`; `stopped`, '
-     '`withheld`, `silent`), reason, age_s, odometry_lag_s (of its last sample behind the last '
-     'image; nan without any), lines_used, points_used, residual_px, expected_px, explained, '
-     'claimed, ambiguity, unobserved, candidates, sigma_x_m, sigma_y_m, sigma_yaw_rad'),
-    ('`localiser: images`',
-     'topic, publishers, frames_received, frames_answered, frames_dropped_busy, '
-     'frames_lost_by_middleware, clock_resets, refused and refused.*cause*, errors and '
-     'error.*function*, last_refusal, last_error'),
-    ('`localiser: time`',
-     'decode_ms, predict_ms, detect_ms, associate_ms, measure_ms, refine_ms, total_ms, '
-     'arrival_to_answer_ms'),
-    ('`localiser: calibration`',
-     'condition (`unknown`, `good`, `suspect`), frames, statistic, limit, pose_error_m; a warning '
-     'when the residuals say that the rig has moved'),
-)
-"""The statuses in /diagnostics and their values."""
 
 CAUSES = (
     ('`image_data`', 'an image of unknown encoding, whose step, size and data do not fit, or '

@@ -30,9 +30,20 @@ from typing import Any
 from nccs_pose.estimation.estimate import State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.text_files import write_text
-from nccs_pose.ros.interface import CAUSES, Endpoint, INPUTS, OUTPUTS, SERVICES, STATUSES, TF_MODES
+from nccs_pose.ros.camera_options import CameraOptions
+from nccs_pose.ros.interface import (
+    CAUSES,
+    Endpoint,
+    INPUTS,
+    OUTPUTS,
+    SERVICES,
+    STAND_IN_OUTPUTS,
+    TF_MODES,
+)
+from nccs_pose.ros.launch_arguments import launch_arguments
 from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.resources import share_directory
+from nccs_pose.ros.statuses import NODE_STATES, STATUSES
 
 HEAD = """\
 # Reference of the node `localiser`
@@ -63,6 +74,21 @@ counted as `tf_missing`. Transforms are stamped with the image's stamp plus `tra
 """
 
 
+DIAGNOSTICS = """\
+Each status is named `<full name of the node>: <part>`. Values without a unit are counts,
+fractions or words; what is not known is nan.
+"""
+
+STAND_IN = """\
+Streams a simulated robot that drives a figure of eight, live. Its parameters are read-only.
+"""
+
+LAUNCH = """\
+`ros2 launch nccs_pose <file> <argument>:=<value>`; `<share>` is the share directory of the
+package.
+"""
+
+
 def page() -> str:
     """The whole page as Markdown."""
     parts = [
@@ -70,10 +96,12 @@ def page() -> str:
         _endpoints(OUTPUTS), '## Services\n', _services(), '## Lifecycle\n', LIFECYCLE,
         '## Transforms\n',
         _left([['`tf_mode`', 'somebody else broadcasts', 'this node broadcasts'], *TF_MODES]),
-        TRANSFORMS, '## Diagnostics\n', _left([['status', 'values'], *STATUSES]),
-        _left([['state', 'when'], *([f'`{state.value}`', state.meaning] for state in State)]),
-        _left([['cause of a refusal', 'what was refused'], *CAUSES]), '## Parameters\n', LIVE,
-        '### Node\n', _options(NodeOptions), '### Estimator\n', _options(LocaliserOptions)]
+        TRANSFORMS, '## Diagnostics\n', DIAGNOSTICS, *_statuses(), '### States\n', _states(),
+        '### Causes of a refusal\n', _left([['cause', 'what was refused'], *CAUSES]),
+        '## Parameters\n', LIVE, '### Node\n', _options(NodeOptions), '### Estimator\n',
+        _options(LocaliserOptions), '## The node `stand_in_camera`\n', STAND_IN,
+        _endpoints(STAND_IN_OUTPUTS), _options(CameraOptions), '## Launch files\n', LAUNCH,
+        *_launch_files()]
     return '\n'.join(parts)
 
 
@@ -89,6 +117,31 @@ def _services() -> str:
     rows = [['name', 'type', 'meaning']]
     rows += [[f'`{e.name}`', f'`{e.type}`', e.doc] for e in SERVICES]
     return _left(rows)
+
+
+def _statuses() -> list[str]:
+    parts = []
+    for status in STATUSES:
+        rows = [['value', 'unit', 'meaning']]
+        rows += [[f'`{value.key}`', value.unit, value.doc] for value in status.values]
+        parts += [f'### `localiser: {status.part}`\n', f'{status.doc}\n', _left(rows)]
+    return parts
+
+
+def _states() -> str:
+    rows = [['state', 'when'], *([f'`{state.value}`', state.meaning] for state in State)]
+    return _left([*rows, *([f'`{state}`', meaning] for state, meaning in NODE_STATES)])
+
+
+def _launch_files() -> list[str]:
+    parts = []
+    for file in sorted((share_directory() / 'launch').glob('*.launch.py')):
+        about, arguments = launch_arguments(file)
+        rows = [['argument', 'default', 'meaning']]
+        rows += [[f'`{a.name}`', f'`{a.default}`' if a.default else '', a.doc]
+                 for a in arguments]
+        parts += [f'### `{file.name}`\n', f'{about}\n', _left(rows)]
+    return parts
 
 
 def _options(group: type) -> str:

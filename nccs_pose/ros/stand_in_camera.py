@@ -20,7 +20,6 @@ figure of eight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import sys
 import time
 
@@ -29,7 +28,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from nccs_pose.errors import NccsPoseError
 from nccs_pose.files.yaml_files import load_map, load_rig
-from nccs_pose.options import check_options, option
+from nccs_pose.ros.camera_options import CameraOptions, SCENES
 from nccs_pose.ros.conversions import (
     camera_info_message,
     compressed_message,
@@ -37,7 +36,16 @@ from nccs_pose.ros.conversions import (
     odometry_message,
     truth_message,
 )
+from nccs_pose.ros.interface import (
+    Endpoint,
+    STAND_IN_IMAGE,
+    STAND_IN_IMAGE_COMPRESSED,
+    STAND_IN_INFO,
+    STAND_IN_ODOM,
+    STAND_IN_TRUTH,
+)
 from nccs_pose.ros.parameters import NodeParameters
+from nccs_pose.ros.qos import overridable, profile
 from nccs_pose.ros.resources import resolve
 from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import use_large_images
@@ -49,35 +57,12 @@ from nccs_pose.simulation.drive import (
     WheelModel,
 )
 from nccs_pose.simulation.motion import figure_of_eight
-from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
+from nccs_pose.simulation.scene import Scene
 import numpy as np
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-
-SCENES = {'arena': arena_scene, 'ideal': ideal_scene}
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """Parameters of the node `stand_in_camera`."""
-
-    rig_file: str = option('config/arena_640_rig.yaml', doc='Rig to render with (YAML).')
-    map_file: str = option('config/arena_map.yaml', doc='Map of the lines (YAML).')
-    scene: str = option(
-        'arena', choices=tuple(SCENES),
-        doc='Look: arena is a room with an ordinary camera, ideal is grey floor and tapes.')
-    rate: float = option(5.0, unit='Hz', low=0.1, high=120.0, doc='Images a second.')
-    duration: float = option(600.0, unit='s', low=1.0, high=7200.0, doc='Length of the drive.')
-    speed: float = option(0.35, unit='m/s', low=0.01, high=3.0, doc='Speed of the robot.')
-    image_transport: str = option(
-        'raw', choices=('raw', 'compressed'), doc='Publish image or image/compressed.')
-    frame_prefix: str = option('', doc='Goes before odom, base_link and camera_optical.')
-    seed: int = option(0, low=0, high=2**31 - 1, doc='Seed of the noise.')
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 class StandInCamera(Node):
@@ -91,15 +76,17 @@ class StandInCamera(Node):
         self._scene = Scene(
             load_rig(resolve(o.rig_file)), load_map(resolve(o.map_file)), look.appearance,
             look.sensor)
-        compressed = o.image_transport == 'compressed'
-        self._image = self.create_publisher(
-            CompressedImage if compressed else Image,
-            'image/compressed' if compressed else 'image', QoSProfile(depth=2))
-        self._info = self.create_publisher(CameraInfo, 'camera_info', QoSProfile(depth=2))
-        self._odometry = self.create_publisher(Odometry, 'odom', QoSProfile(depth=100))
-        self._truth = self.create_publisher(
-            PoseStamped, 'ground_truth/pose', QoSProfile(depth=100))
+        self._image = (
+            self._advertise(CompressedImage, STAND_IN_IMAGE_COMPRESSED)
+            if o.image_transport == 'compressed' else self._advertise(Image, STAND_IN_IMAGE))
+        self._info = self._advertise(CameraInfo, STAND_IN_INFO)
+        self._odometry = self._advertise(Odometry, STAND_IN_ODOM)
+        self._truth = self._advertise(PoseStamped, STAND_IN_TRUTH)
         self.skipped = 0
+
+    def _advertise(self, kind: type, endpoint: Endpoint) -> Publisher:
+        return self.create_publisher(
+            kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
 
     def drive(self) -> None:
         """Drive once; a frame that cannot be rendered in time is left out."""

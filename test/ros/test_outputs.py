@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
@@ -25,12 +27,13 @@ from nccs_pose.calibration.monitor import Condition, Verdict
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.ros import calibration_watch
+from nccs_pose.ros import calibration_watch, diagnostics
 from nccs_pose.ros import outputs as outputs_module
 from nccs_pose.ros.conversions import decode
 from nccs_pose.ros.markers import ELLIPSE_SIGMAS, marker_array
 from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
+from nccs_pose.ros.statuses import STATUSES
 from nccs_pose.simulation.scene import arena_map, arena_rig
 from nccs_pose.vision.line_points import LinePoints
 import numpy as np
@@ -123,6 +126,22 @@ def test_markers_lie_in_the_map():
     np.testing.assert_allclose(axes, [2 * ELLIPSE_SIGMAS * 0.01, 2 * ELLIPSE_SIGMAS * 0.02])
     gone = marker_array('map', LOST, RIG, MAP).markers
     assert [m.action for m in gone] == [Marker.ADD, *[Marker.DELETE] * 3]
+
+
+@pytest.mark.parametrize('part', ['pose', 'images', 'time', 'calibration'])
+def test_every_value_of_the_diagnostics_is_in_the_reference(part: str):
+    tally = diagnostics.Tally()
+    tally.refuse('image_size', 'small')
+    tally.fail('module.function', RuntimeError('a mistake'))
+    shown = {
+        'pose': diagnostics.pose_status('n', 'active', '', '', TRACKING, 0.1, 0.1),
+        'images': diagnostics.image_status('n', '/image', 1, tally, '', 0, 0),
+        'time': diagnostics.time_status('n', TRACKING, 0.1, 0.1),
+        'calibration': calibration_watch.CalibrationWatch(RIG, MAP).status('n')}[part]
+    published = [re.sub(r'(refused|error)\..*', r'\1.*', value.key) for value in shown.values]
+    (documented,) = ([value.key for value in s.values] for s in STATUSES if s.part == part)
+    assert shown.name == f'n: {part}'
+    assert sorted(published) == sorted(documented)
 
 
 class Monitor:
