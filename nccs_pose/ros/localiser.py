@@ -31,6 +31,13 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _leave)
+    from nccs_pose.estimation.options import LocaliserOptions
+    from nccs_pose.ros.command_line import read_command_line
+    from nccs_pose.ros.node_options import NodeOptions
+
+    read_command_line(
+        'localiser', 'Localise a robot from images of floor lines in a curved mirror.',
+        NodeOptions, LocaliserOptions)
     from nccs_pose.ros.localiser_node import make_node
     from nccs_pose.ros.spinning import run
 

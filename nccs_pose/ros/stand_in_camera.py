@@ -29,6 +29,7 @@ from nav_msgs.msg import Odometry
 from nccs_pose.errors import NccsPoseError
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.camera_options import CameraOptions, SCENES
+from nccs_pose.ros.command_line import read_command_line
 from nccs_pose.ros.conversions import (
     camera_info_message,
     compressed_message,
@@ -147,6 +148,7 @@ class StandInCamera(Node):
 
 def main() -> int:
     """Entry point of `ros2 run nccs_pose stand_in_camera`."""
+    read_command_line('stand_in_camera', 'Stream a simulated robot live.', CameraOptions)
     use_large_images()
     try:
         initialise()

@@ -29,8 +29,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nccs_pose.ros.command_line import without_ros
 from nccs_pose.ros.conversions import image_message
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool, Trigger
 
@@ -258,6 +260,32 @@ def test_paused_it_uses_no_image_and_says_so(world, arena):
     assert user.wait(lambda: user.value('localiser: pose', 'reason') != 'paused')
     user.show(images, *messages[2:5])
     assert user.count('frames_answered') > 0
+
+
+@pytest.mark.parametrize('module', [
+    'localiser', 'stand_in_camera', 'player', 'demo', 'stream_benchmark'])
+def test_help_is_printed_and_nothing_is_started(world, module):
+    node = world.start(module, '--help', '--ros-args', '-r', '__node:=other')
+    assert node.wait() == 0, node.output
+    assert node.output.startswith('usage: ')
+
+
+@pytest.mark.parametrize(('module', 'parameter'), [
+    ('localiser', '  noise_gate (4.5)'), ('stand_in_camera', '  rate (5.0 Hz)')])
+def test_the_help_of_a_node_has_its_parameters_and_no_other_argument_is_taken(
+        world, module, parameter):
+    helped, wrong = world.start(module, '-h'), world.start(module, '--hlep')
+    assert helped.wait() == 0
+    assert parameter in helped.output
+    assert wrong.wait() == 2
+    assert 'unrecognized arguments: --hlep' in wrong.output
+
+
+@pytest.mark.parametrize(('arguments', 'own'), [
+    (['--ros-args', '-p', 'a:=1'], []), (['x', '--ros-args', '-p', 'a:=1', '--', 'y'], ['x', 'y']),
+    (['--ros-args', '--ros-args', '--', '--help', '--ros-args'], ['--help'])])
+def test_the_arguments_of_ros_are_left_to_it(arguments, own):
+    assert without_ros(arguments) == own == remove_ros_args(['name', *arguments])[1:]
 
 
 @pytest.mark.parametrize('arguments', [
