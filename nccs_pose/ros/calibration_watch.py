@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import math
+
 from diagnostic_msgs.msg import DiagnosticStatus
 from nccs_pose.calibration.monitor import CalibrationMonitor, Condition
 from nccs_pose.estimation.estimate import Estimate
@@ -45,7 +47,9 @@ class CalibrationWatch:
         verdict = self._monitor.verdict()
         level = (DiagnosticStatus.WARN if verdict.condition is Condition.SUSPECT
                  else DiagnosticStatus.OK)
+        known = verdict.condition is not Condition.UNKNOWN  # else a zero is no good news
         return status(f'{node}: calibration', level, verdict.words, {
             'condition': verdict.condition.value, 'frames': verdict.frames,
-            'statistic': float(verdict.statistic), 'limit': float(verdict.limit),
-            'pose_error_m': float(verdict.pose_error)})
+            'statistic': float(verdict.statistic) if known else math.nan,
+            'limit': float(verdict.limit) if known else math.nan,
+            'pose_error_m': float(verdict.pose_error) if known else math.nan})

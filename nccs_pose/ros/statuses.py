@@ -122,9 +122,10 @@ STATUSES = (
               'has moved, or never was as its file says.'),
         Value('frames', 'Places that the images judged by were taken from.'),
         Value('statistic', 'How far the residuals of all places pull at the rig together, '
-              'squared, in units of chance.'),
-        Value('limit', 'What chance makes statistic exceed once in 10000 times; inf while '
-              'unknown.'),
+              'squared, in units of chance; nan while unknown.'),
+        Value('limit', 'What chance makes statistic exceed once in 10000 times; nan '
+              'likewise.'),
         Value('pose_error_m', 'By how much poses would move under the rig that the residuals ask '
-              'for; above limit and 5 mm it is suspect.', 'm'))),
+              'for; with statistic above limit and this above 5 mm it is suspect; nan likewise.',
+              'm'))),
 )

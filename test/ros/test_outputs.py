@@ -170,6 +170,9 @@ def test_calibration_is_watched_now_and_then_and_a_suspicion_is_a_warning(
     assert len(monitor.seen) == 7
     assert min(np.diff(monitor.seen[:-1])) >= calibration_watch.PERIOD_NS
     assert watch.status('localiser').level == DiagnosticStatus.OK
+    monitor.condition = Condition.UNKNOWN
+    values = {v.key: v.value for v in watch.status('localiser').values}
+    assert values['statistic'] == values['limit'] == values['pose_error_m'] == 'nan'
     monitor.condition = Condition.SUSPECT
     status = watch.status('localiser')
     assert (status.name, status.level) == ('localiser: calibration', DiagnosticStatus.WARN)
