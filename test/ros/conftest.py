@@ -43,15 +43,20 @@ def _is_free(domain: int) -> bool:
     return True
 
 
+def _free_domain() -> int:
+    """A domain of one's own: 1 to 99 are safe on every system."""
+    # Neighbours in time and other runs differ.
+    domains = (1 + (os.getpid() * 7 + next(_NUMBERS)) % 99 for _ in range(99))
+    return next(domain for domain in domains if _is_free(domain))
+
+
 @contextlib.contextmanager
 def a_world(folder: Path) -> Iterator[Any]:
     """A DDS domain of its own, with a user in it."""
     pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
     from harness import World
 
-    # Domains 1 to 99 are safe on every system; neighbours in time and other runs differ.
-    domains = (1 + (os.getpid() * 7 + next(_NUMBERS)) % 99 for _ in range(99))
-    domain = next(domain for domain in domains if _is_free(domain))
+    domain = _free_domain()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_LOG_DIR', str(folder / 'ros_log'))
         world = World(domain, folder)
@@ -85,13 +90,16 @@ def pair(
 
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=1 + os.getpid() % 99)
+    rclpy.init(context=context, domain_id=_free_domain())
     pair = Pair(context, getattr(request, 'param', {}))
     try:
         yield pair
         pair.node.close()
     finally:
         pair.executor.shutdown()
+        # What is left to the garbage collector would be met by the next test.
+        pair.node.destroy_node()
+        pair.user.destroy_node()
         rclpy.shutdown(context=context)
 
 
