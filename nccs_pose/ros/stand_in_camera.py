@@ -26,7 +26,7 @@ import time
 import cv2
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from nccs_pose.errors import NccsPoseError
+from nccs_pose.errors import NccsPoseError, OptionError
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.camera_options import CameraOptions, SCENES
 from nccs_pose.ros.command_line import read_command_line
@@ -45,6 +45,7 @@ from nccs_pose.ros.interface import (
     STAND_IN_ODOM,
     STAND_IN_TRUTH,
 )
+from nccs_pose.ros.lifecycle import in_words
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.qos import overridable, profile
 from nccs_pose.ros.resources import resolve
@@ -86,8 +87,11 @@ class StandInCamera(Node):
         self.skipped = 0
 
     def _advertise(self, kind: type, endpoint: Endpoint) -> Publisher:
-        return self.create_publisher(
-            kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
+        try:
+            return self.create_publisher(
+                kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
+        except Exception as error:  # rclpy raises what the value led to
+            raise OptionError(in_words(error)) from error
 
     def drive(self) -> None:
         """Drive once; a frame that cannot be rendered in time is left out."""

@@ -124,6 +124,15 @@ def test_an_impossible_depth_is_named(world, topic, end, state):
     assert 'depth = -1: must lie in' in user.value('localiser: pose', 'reason')
 
 
+@pytest.mark.parametrize('override', ['depth:=0', 'depth:=deep', 'reliability:=perhaps'])
+def test_an_impossible_override_ends_the_stand_in_camera_with_a_sentence(world, override):
+    camera = world.start(
+        'stand_in_camera', '--ros-args', '-p', f'qos_overrides./odom.publisher.{override}')
+    assert camera.wait() == 2
+    assert override.partition(':=')[0] in camera.output
+    assert 'Traceback' not in camera.output
+
+
 def test_unknown_parameter_is_named_with_the_one_meant(world):
     misspelt = 'qos_overrides./image.subscription.reliabilty'
     node, user = world.localiser('-p', f'{misspelt}:=reliable', map_fil='x', **ROOM), world.user
