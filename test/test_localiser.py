@@ -43,6 +43,7 @@ from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
+from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
 import numpy as np
@@ -1055,6 +1056,19 @@ def test_a_line_beside_its_place_is_named_and_no_pose_is_given() -> None:
 
 
 # ---------------------------------------------------------------- a floor that is not flat
+
+
+def test_a_tape_that_compression_drowns_is_not_seen_beside_its_place() -> None:
+    """The far one of a drive past the arena's eastern end, a third of a pixel wide."""
+    scene, track, answers = arena_scene(640), figure_of_eight(), []
+    localiser, rng = Localiser(scene.rig, scene.line_map), np.random.default_rng(0)
+    for k in range(27, 72):
+        stamp = k * PERIOD_NS
+        pose = track.pose(0.1 * k)
+        localiser.add_odometry(stamp, pose)
+        if not k % 2:
+            answers.append(localiser.process(stamp, render(scene, pose, rng)).state)
+    assert answers == [State.TRACKING] * 22
 
 
 def _tilted(scene: Scene, roll: float, pitch: float) -> Scene:
