@@ -15,17 +15,18 @@
 
 Section III of Mateus, Miraldo and Lima; a named baseline, not what the localiser uses. Lines go
 from the world to the mirror frame by p^C = R p^W + t with R a turn by theta about the mirror's
-axis and t_z known (eqs. 15 and 16), which makes the curve of each mirror point a polynomial
+axis and t_z known (eq. 15, eq. 16), which makes the curve of each mirror point a polynomial
 
     gamma_r(c, s, t_x, t_y) = E^2 (P^2 + W Q^2),   P of degree 2 (9 monomials), Q of degree 1 (4)
 
-of degree 4 (47 monomials, eq. 19). The problem (eq. 21) is
+of degree 4 (47 monomials; eq. 17, eq. 19). The problem (eq. 21) is
 
     min mean |gamma_r|   s.t.   g_1 = c^2 + s^2 - 1 = 0,   g_2 = mean (x - P / Q)^2 = 0
 
 solved by SLSQP with analytic gradients in the place of MATLAB's fmincon, from a first guess; the
-inverse transform at the end (eq. 22) gives T_map_base. What the print leaves open: g_2 is summed
-over the points, and the overall scale of gamma_r is set to 1 at the start, which moves no minimum.
+inverse transform at the end (eq. 22) gives T_map_base. What the print leaves open: g_2 is the
+mean over the points, and the overall scale of gamma_r is set to 1 at the start, which moves no
+minimum.
 With noise g_2 = 0 has no solution, hence the option to leave it out. As printed, the points weigh
 by the sizes of their polynomials, which differ by orders of magnitude over a mirror; dividing each
 by the norm of its coefficients, which the paper does not do, is the other option.
@@ -60,7 +61,7 @@ class PaperEstimate:
     """What the paper's problem ended in.
 
     :ivar pose: T_map_base.
-    :ivar theta: turn from the world to the camera frame, radians (the paper's R).
+    :ivar theta: turn from the world to the camera frame, radians (the paper's R, eq. 15).
     :ivar translation: (t_x, t_y, t_z) from the world to the camera frame, metres (the paper's t).
     :ivar objective: mean |gamma_r|, of its value at the start.
     :ivar g1: c^2 + s^2 - 1 where it ended.
@@ -192,7 +193,7 @@ class PaperProblem:
         return p, self.q_rows @ (c, s, t_y, 1.0), self.p_rows @ slopes
 
     def gamma_r(self, parameters: Array) -> tuple[Array, Array]:
-        """gamma_r (M,) (eq. 19) and its gradient by (c, s, t_x, t_y) (M, 4)."""
+        """gamma_r (M,) (eq. 17, eq. 19) and its gradient by (c, s, t_x, t_y) (M, 4)."""
         p, q, dp = self._p_and_q(*parameters.tolist())
         square = self.E**2
         gamma = square * (p * p + self.W * q * q)
@@ -298,4 +299,5 @@ def _solve(
 
 
 def _g1(parameters: Array) -> float:
+    """c^2 + s^2 - 1 (eq. 18)."""
     return float(parameters[0] ** 2 + parameters[1] ** 2 - 1.0)

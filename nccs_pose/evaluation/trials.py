@@ -181,7 +181,7 @@ def _answer(name: str, pose: Pose2 | None, truth: Pose2, bound: Array | None) ->
 def make_data_set(
     rig: Rig, options: ExperimentOptions, cell: Cell, rng: np.random.Generator,
 ) -> DataSet:
-    """Random lines, a random pose, noisy pixels.
+    """Random lines (the paper's eq. 23), a random pose, noisy pixels.
 
     :raises SimulationError: if the rig hardly sees any line of this range.
     """
