@@ -75,7 +75,7 @@ def test_a_data_set_is_what_it_says(mirror: str, on_floor: bool) -> None:
     assert noise == pytest.approx(1.0, abs=0.2)
     start = data.start.as_array() - data.truth.as_array()
     assert 0.0 < np.hypot(*start[:2]) <= options.start_distance
-    assert abs(start[2]) <= np.radians(options.start_angle)
+    assert abs(start[2]) <= np.radians(options.start_angle_deg)
 
 
 def test_world_noise_moves_the_rays_off_their_lines() -> None:
