@@ -54,6 +54,7 @@ from scipy.optimize import minimize
 # (c, s, t_x, t_y) that each monomial of P is the product of: c^2 + s^2 stays unsubstituted.
 P_MONOMIALS = ('cc', 'ss', 'cx', 'sx', 'cy', 'sy', 'c', 's', 'x')
 Q_MONOMIALS = ('c', 's', 'y', '1')
+_MOST_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +223,6 @@ def paper_estimate(
     *,
     use_g2: bool = True,
     normalised: bool = False,
-    max_iterations: int = 100,
 ) -> PaperEstimate:
     """The pose by the paper's problem (eq. 21).
 
@@ -252,12 +252,10 @@ def paper_estimate(
     if not hit.all():
         raise EstimationError(f'{int((~hit).sum())} of {len(pixels)} pixels miss the mirror')
     problem = PaperProblem(rig, points, directions, moments, normalised=normalised)
-    return _solve(problem, start, use_g2, max_iterations)
+    return _solve(problem, start, use_g2)
 
 
-def _solve(
-    problem: PaperProblem, start: Pose2, use_g2: bool, max_iterations: int,
-) -> PaperEstimate:
+def _solve(problem: PaperProblem, start: Pose2, use_g2: bool) -> PaperEstimate:
     first = problem.frame.parameters(start)
     scale = float(np.abs(problem.gamma_r(first)[0]).mean())
     scale = scale if scale > 0.0 else 1.0
@@ -286,7 +284,7 @@ def _solve(
             'jac': lambda v: problem.g2(v)[1] / unit})
     result = minimize(
         objective, first, jac=True, method='SLSQP', constraints=constraints,
-        options={'maxiter': max_iterations, 'ftol': 1e-12})
+        options={'maxiter': _MOST_ITERATIONS, 'ftol': 1e-12})
     # Where the constraints cannot be met SLSQP may give back its start: take the best it saw.
     found: Array = result.x if result.success else best
     if not np.isfinite(found).all() or math.hypot(found[0], found[1]) < 1e-12:
