@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.refine import refine
-from nccs_pose.estimation.residual import side, side_gradient, whitened_residual
+from nccs_pose.estimation.residual import lines_in_base, side, whitened_residual
 from nccs_pose.estimation.side_form import SideForm
 from nccs_pose.geometry import Line, LineMap, Pose2, Rays, Rig
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -112,7 +112,9 @@ def test_the_residual_is_the_distance_in_the_image(name: str) -> None:
     pixels, label = seen(rig, FLOOR, pose, 20, np.random.default_rng(2))
     rays = rig.back_project(pixels)
     d, mu = FLOOR.directions[label], FLOOR.moments[label]
-    gradient = side_gradient(rays, d, mu, pose)
+    in_base, moment = lines_in_base(d, mu, pose)
+    gradient = (np.einsum('nij,ni->nj', rays.direction_jacobian, moment)
+                + np.einsum('nij,ni->nj', rays.moment_jacobian, in_base))
     normal = gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     for shift in (0.5, -0.2):
         moved = rig.back_project(pixels + shift * normal)

@@ -81,13 +81,6 @@ def side(rays: Rays, directions: Array, moments: Array, pose: Pose2) -> Array:
     return np.einsum('ni,ni->n', rays.direction, mu) + np.einsum('ni,ni->n', rays.moment, d)
 
 
-def side_gradient(rays: Rays, directions: Array, moments: Array, pose: Pose2) -> Array:
-    """dS/d(u, v) (N, 2), metres per pixel."""
-    d, mu = lines_in_base(directions, moments, pose)
-    return (np.einsum('nij,ni->nj', rays.direction_jacobian, mu)
-            + np.einsum('nij,ni->nj', rays.moment_jacobian, d))
-
-
 def whitened_residual(
     rays: Rays,
     directions: Array,
