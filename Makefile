@@ -72,7 +72,7 @@ demo: $(READY)
 ifeq ($(ROS),none)
 	@echo '$(NO_NODE) The same bag offline:'
 	@$(VENV)/bin/nccs-pose replay bags/room --rig config/room_rig.yaml --map config/room_map.yaml \
-		--output out/room.tum --plots out
+		--params config/room.yaml --output out/room.tum --plots out
 else
 	@$(RUN) -m nccs_pose.ros.demo $(ARGS)
 endif

@@ -42,8 +42,10 @@ def repository() -> Path:
 
 @pytest.fixture(scope='session')
 def ray_traced() -> Path:
-    """Folder of the ray-traced sequences; tests that need it skip where it is absent."""
-    folder = Path(os.environ.get('NCCS_POSE_RAY_TRACED', REPOSITORY.parent / 'shared' / 'data'))
-    if not (folder / 'dev_clean').is_dir():
-        pytest.skip(f'no ray-traced sequences at {folder} (set NCCS_POSE_RAY_TRACED)')
-    return folder
+    """Folder of the ray-traced sequences, which are not shipped; without it tests skip."""
+    folder = os.environ.get('NCCS_POSE_RAY_TRACED')
+    if not folder:
+        pytest.skip('the ray-traced sequences are not shipped; NCCS_POSE_RAY_TRACED names a copy')
+    if not (Path(folder) / 'dev_clean').is_dir():
+        pytest.fail(f'NCCS_POSE_RAY_TRACED: no sequence dev_clean in {folder!r}')
+    return Path(folder)

@@ -29,6 +29,7 @@ from nccs_pose.errors import OptionError, SimulationError
 from nccs_pose.estimation.residual import side
 from nccs_pose.evaluation import benchmark
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
+from nccs_pose.evaluation.experiment_plots import box_figure
 from nccs_pose.evaluation.experiment_summary import summarise_cell
 from nccs_pose.evaluation.experiments import (
     cells_of,
@@ -75,7 +76,7 @@ def test_a_data_set_is_what_it_says(mirror: str, on_floor: bool) -> None:
     assert noise == pytest.approx(1.0, abs=0.2)
     start = data.start.as_array() - data.truth.as_array()
     assert 0.0 < np.hypot(*start[:2]) <= options.start_distance
-    assert abs(start[2]) <= np.radians(options.start_angle)
+    assert abs(start[2]) <= np.radians(options.start_angle_deg)
 
 
 def test_world_noise_moves_the_rays_off_their_lines() -> None:
@@ -275,3 +276,21 @@ def test_the_benchmark_command(tmp_path: Path, capsys: pytest.CaptureFixture) ->
     assert results['least_squares_apart'] < 1e-6
     if results['poselib_apart'] is not None:
         assert results['poselib_apart'] < 1e-6
+
+
+def test_boxes_below_the_axis_are_marked_on_it() -> None:
+    """Without noise what is left is rounding, seven orders of magnitude below all else."""
+    def trials(*sizes: float) -> list[tuple[Answer, ...]]:
+        return [tuple(
+            Answer(name, (size * part, 0.0, size * part), None)
+            for name, size in zip(('paper', 'ours'), sizes)) for part in (1.0, 1.2, 1.5)]
+
+    noisy = [(cell(level=k, sigma_px=k), trials(0.1, 0.01)) for k in (1.0, 2.0)]
+    clean = (cell(level=0.0, sigma_px=0.0), trials(0.1, 1e-9))
+    for results, marks in ((noisy, 0), ([clean, *noisy], 1)):
+        figure = box_figure('errors', 'px', results)
+        for axes in figure.axes:
+            marked = [line for line in axes.lines if line.get_marker() == 'v']
+            assert [round(line.get_xdata()[0], 1) for line in marked] == [-0.1] * marks
+        legend = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert ('below the axis' in legend) == bool(marks)

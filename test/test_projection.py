@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.mirror import QuadricMirror
-from nccs_pose.geometry.point_polynomial import real_roots, reflection_polynomial
+from nccs_pose.geometry.point_polynomial import PointConditions, real_roots
 from nccs_pose.geometry.projection import _Scene, reflect_points
 from nccs_pose.simulation.table_one import TABLE_ONE
 import numpy as np
@@ -68,6 +68,17 @@ def lit_points(
     m = m[facing]
     distance = np.exp(rng.uniform(np.log(1e-3), np.log(10.0), len(m)))
     return m, m + distance[:, None] * reflected(mirror, cop, m)
+
+
+def polynomial(
+    mirror: QuadricMirror, cop: np.ndarray, points: np.ndarray, unit: float,
+) -> np.ndarray:
+    """G(z) of points, all lengths in a unit; on the axis they are turned into the plane x = 0."""
+    if cop[1] == 0.0:
+        radius = np.hypot(points[:, 0], points[:, 1])
+        points = np.column_stack([np.zeros(len(points)), radius, points[:, 2]])
+    quadric = mirror.A, mirror.B / unit, mirror.C / unit**2
+    return PointConditions(quadric, tuple(cop[1:] / unit), points / unit).polynomial()
 
 
 def space_points(count: int, seed: int) -> np.ndarray:
@@ -159,8 +170,7 @@ def test_invisible_means_behind_the_mirror(name: str) -> None:
 def test_degree_of_the_polynomial(name: str) -> None:
     mirror, cop = SCENES[name]
     points = space_points(200, seed=5)
-    coefficients = reflection_polynomial(
-        (mirror.A, mirror.B * 1e3, mirror.C * 1e6), tuple(cop[1:] * 1e3), points * 1e3)
+    coefficients = polynomial(mirror, cop, points, 1e-3)
     relative = np.abs(coefficients) / np.abs(coefficients).max(axis=1, keepdims=True)
     top = coefficients.shape[1] - 1
     degree = DEGREES[name]
@@ -176,8 +186,7 @@ def test_reflections_are_roots_of_the_polynomial(name: str) -> None:
     points = points[np.abs(points[:, 0]) > 1e-3]
     m, _ = reflect_points(mirror, cop, points)
     unit = 0.05
-    coefficients = reflection_polynomial(
-        (mirror.A, mirror.B / unit, mirror.C / unit**2), tuple(cop[1:] / unit), points / unit)
+    coefficients = polynomial(mirror, cop, points, unit)
     roots, real = real_roots(coefficients, 1e-3)
     away = np.where(real, np.abs(roots - m[:, 2:] / unit), np.inf).min(axis=1)
     assert np.median(away) < 1e-11

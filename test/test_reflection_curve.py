@@ -17,10 +17,12 @@
 from __future__ import annotations
 
 from nccs_pose.errors import GeometryError
+from nccs_pose.estimation.residual import side
 from nccs_pose.geometry.line_trace import trace_line, trace_pieces
 from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.paper_polynomials import mirror_polynomials, paper_polynomials
+from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.reflection_curve import Branch, ReflectionCurve
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -130,12 +132,31 @@ def test_gamma_on_the_mirror_is_side_times_mirrored_side(name: str) -> None:
            - 2.0 * n * np.sum(v_i * n, axis=1, keepdims=True))
     for q, d in random_lines(RNG_LINES, seed=6):
         curve = ReflectionCurve(mirror, cop, q, d)
-        side = np.einsum('ni,ni->n', v_r, np.cross(d, q - points))
-        assert curve.side(points) == pytest.approx(side, rel=1e-7, abs=1e-9 * np.abs(side).max())
+        product = np.einsum('ni,ni->n', v_r, np.cross(d, q - points))
+        assert curve.side(points) == pytest.approx(
+            product, rel=1e-7, abs=1e-9 * np.abs(product).max())
         e, _, _, _ = curve.factors(points[:, 1], points[:, 2])
         product = e**2 * curve.side(points) * curve.side(points * [-1.0, 1.0, 1.0])
         gamma = curve.gamma(points[:, 1], points[:, 2])
         assert product == pytest.approx(gamma, rel=1e-7, abs=1e-9 * np.abs(gamma).max())
+
+
+@pytest.mark.parametrize('name', TABLE_ONE)
+def test_the_curve_has_the_estimators_side_by_the_factor_that_it_says(name: str) -> None:
+    """P - x Q = -N |v_i| S, with the S of unit rays and of lines in the map."""
+    rig = TABLE_ONE[name]
+    pixels = np.random.default_rng(3).uniform((0, 0), (1200, 800), (200, 2))
+    points, hit = rig.mirror_points(pixels)
+    points, rays = points[hit], rig.back_project(pixels[hit])
+    assert len(points) > 20
+    n = (rig.mirror.normal(points)**2).sum(axis=1)
+    scale = -n * np.linalg.norm(points - rig.cop, axis=1)
+    for q, d in random_lines(RNG_LINES, seed=6):
+        line = Line(q, q + d)
+        lines = (np.tile(v, (len(points), 1)) for v in (line.direction, line.moment))
+        expected = scale * side(rays, *lines, Pose2())
+        found = ReflectionCurve.of_line(rig, line).side(points)
+        assert found == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize('name', TABLE_ONE)
@@ -164,7 +185,10 @@ def test_projected_points_lie_on_the_curve(name: str) -> None:
 
 
 def test_the_prints_sign_of_k_is_wrong() -> None:
-    """With k = m + n, as printed, x = c11 / c10 is off by per cents, and right for a sphere."""
+    """With k = m + n, as printed, eq. 6 gives another x; for a sphere there is no difference.
+
+    The numbers are those of docs/paper.md.
+    """
     def printed_x(mirror: QuadricMirror, cop: np.ndarray, q, d, m) -> np.ndarray:
         # eq. 6 by its own words: the plane of p(lambda), o and the printed k, solved for x
         k_z = m[:, 2] - mirror.A * m[:, 2] + mirror.B / 2
@@ -177,15 +201,15 @@ def test_the_prints_sign_of_k_is_wrong() -> None:
     errors = {}
     for name, rig in TABLE_ONE.items():
         relative = []
-        for q, d in random_lines(RNG_LINES, seed=9):
+        for q, d in random_lines(400, seed=9):
             m, visible = reflect_points(
                 rig.mirror, rig.cop, q + np.linspace(-2.0, 2.0, 41)[:, None] * d)
             m = m[visible]
             relative.append(np.abs(printed_x(rig.mirror, rig.cop, q, d, m) / m[:, 0] - 1.0))
         errors[name] = float(np.median(np.concatenate(relative)))
     assert errors['spherical'] < 1e-9
-    assert errors['hyperbolic'] > 0.02
-    assert errors['parabolic'] > 0.10
+    assert errors['hyperbolic'] == pytest.approx(0.26, abs=0.02)
+    assert errors['parabolic'] == pytest.approx(3.34, abs=0.1)
 
 
 @pytest.mark.parametrize('name', TABLE_ONE)

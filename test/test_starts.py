@@ -151,7 +151,10 @@ def test_a_vague_pose_decides_for_no_place_while_others_near_it_were_passed_over
     """On the lattice, given as by RViz: 0.5 m and 15 degrees allow several cells."""
     pose, answers = _given_on_the_lattice(seed, (0.5, 0.5, 0.262))
     for answer in answers:
-        assert answer.pose is None or same_pose(answer.pose, pose)
+        places = [answer.pose] if answer.pose is not None else [
+            candidate.pose for candidate in answer.candidates]
+        # One place is right or not given; of several one is.
+        assert sum(same_pose(place, pose) for place in places) == 1
 
 
 @pytest.mark.parametrize('seed', [3, 6, 27])

@@ -16,7 +16,7 @@
 
 With the reflected ray (r, m) and a line (d, mu) in the map frame, S = r . mu + d . (m x r) has
 the derivatives a = dS/dr = mu + d x m and b = dS/dm = r x d. Everything else is the chain rule
-run backwards through the reflection (the paper's eqs. 8 to 10), two vectors a point, whatever the
+run backwards through the reflection (the paper's eqs. 9 to 11), two vectors a point, whatever the
 number of parameters:
 
     r = v - 2 k n,  k = v.n / n.n       a_v = a - 2 (a.n / n.n) n,  a_n = -2 ((a.n / n.n) r + k a)

@@ -38,6 +38,8 @@ from nccs_pose.vision.segment import Segmentation
 import numpy as np
 from numpy.typing import NDArray
 
+# Of a colour so many strips are enough.
+_MOST_STRIPS = 16
 # A line needs so many pixels and so much length, metres.
 _LEAST_PIXELS = 10
 # Of a large blob only some pixels are looked at; a few of them in a row are no line yet.
@@ -104,16 +106,15 @@ class FloorSegment:
 
 
 def floor_segments(
-    segmentation: Segmentation, floor: PixelFloor, width: float, colour: str, most: int = 16,
+    segmentation: Segmentation, floor: PixelFloor, width: float, colour: str,
     longest: float = math.inf,
 ) -> tuple[FloorSegment, ...]:
-    """Straight strips among the blobs, those of most pixels first.
+    """At most 16 straight strips among the blobs, those of most pixels first.
 
     :param floor: behind the pixels of the blobs' mask.
     :param width: width of the tapes, metres.
-    :param longest: length of the longest of them, metres.
     :param colour: their colour class.
-    :param most: at most so many.
+    :param longest: length of the longest of them, metres.
     """
     if len(segmentation.pixels) == 0:
         return ()
@@ -132,7 +133,7 @@ def floor_segments(
     counts = np.array([points.weight, free], np.float32)
     support, starts = (counts @ near).astype(float)
     segments: list[FloorSegment] = []
-    while len(segments) < most:
+    while len(segments) < _MOST_STRIPS:
         support[starts < _LEAST_START] = -np.inf
         best = int(support.argmax())
         if support[best] < _LEAST_PIXELS:

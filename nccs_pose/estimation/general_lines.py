@@ -114,7 +114,11 @@ def _minima_of_slope(slope: NDArray[np.complex128]) -> Array:
 
 
 def minimum_at(gram: Array, yaw: float) -> Minimum:
-    """The pose with the best translation at a yaw."""
+    """The pose with the best translation at a yaw.
+
+    :param gram: Gram matrix of S (7, 7).
+    :param yaw: radians.
+    """
     form = monomials_and_slopes(0.0, 0.0, yaw)[:3]
     (q22, q02, q12), (_, q00, q01), (_, _, q11) = (form @ gram @ form.T).tolist()
     a, b, d = inverse_2x2(q00, q01, q11)

@@ -100,7 +100,10 @@ def global_minimum(gram: Array, directions: Array) -> Minimum:
 
 
 def proved_minimum(gram: Array) -> Minimum | None:
-    """The global minimum where the samples prove it to be so, else None."""
+    """The global minimum where the samples prove it to be so, else None.
+
+    :param gram: Gram matrix of S (7, 7).
+    """
     samples = ratio(gram).T
     full, minor = (_REFINE @ samples).T
     if minor.min() <= ROUNDING * minor.max():
@@ -113,7 +116,10 @@ def proved_minimum(gram: Array) -> Minimum | None:
 
 
 def coefficients(gram: Array) -> Array:
-    """N and D (10, 2) in 1, 0, cos yaw, sin yaw, cos 2 yaw, .. sin 4 yaw."""
+    """N and D (10, 2) in 1, 0, cos yaw, sin yaw, cos 2 yaw, .. sin 4 yaw.
+
+    :param gram: Gram matrix of S (7, 7).
+    """
     return _FOURIER @ ratio(gram).T
 
 
@@ -121,6 +127,7 @@ def is_global(full_and_minor: Array, yaw: float) -> bool:
     """Whether a local minimum of J is proved to be the global one.
 
     :param full_and_minor: coefficients of N and D (10, 2).
+    :param yaw: of the minimum, radians.
     """
     here = np.exp(yaw * _HARMONICS)
     full, minor = (here.view(float) @ full_and_minor).tolist()

@@ -87,7 +87,12 @@ def one_of_each(poses: Poses, order: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def distinct(poses: Poses, score: Array) -> list[int]:
-    """The best of each group of poses that are the same, best first."""
+    """The best of each group of poses that are the same, best first.
+
+    :param poses: (H,).
+    :param score: of each (H,).
+    :returns: indices into them.
+    """
     order = np.argsort(-score, kind='stable')
     # Products of narrow matrices are far cheaper than differences of all with all.
     at = np.stack([part[order].view(np.float64).reshape(-1, 2).astype(np.float32)

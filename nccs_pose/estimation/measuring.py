@@ -172,6 +172,11 @@ class Measurer:
     ) -> Refinement | None:
         """Look for the tapes up to so many pixels beside where a pose predicts them, and solve.
 
+        :param image: (H, W, 3) uint8 BGR.
+        :param start: the predicted pose, T_map_base.
+        :param prior: a pose with its information (3, 3), weighed in like a measurement.
+        :param colours: what the tapes look like, one for each class.
+        :param reach: to either side, px.
         :returns: None where too few stations show one.
         """
         places = self.predictor.places(start, _SEARCHED_SPACING, _SEARCHED)

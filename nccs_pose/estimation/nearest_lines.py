@@ -80,17 +80,18 @@ class NearestLines:
         self._nearest = nearest.reshape(2, -1)
 
     def layers(self, colours: tuple[str, ...]) -> NDArray[np.intp]:
-        """The layer of each of some colours, for :meth:`at`.
+        """The layer of each of P colours (P,), for :meth:`at`.
 
         :raises ValueError: for a colour that no line has.
         """
         return np.array([self._cells * self._colours.index(colour) for colour in colours])
 
     def at(self, points: Complex, layer: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
-        """Which line is nearest to each of points (H, P), and how far to its left it lies, metres.
+        """The line nearest to each point, and how far to its left that lies, metres; both (H, P).
 
         Without a line near it has the number of lines and lies farther off than any is.
 
+        :param points: P points in each of H poses, x + iy in the map (H, P), metres.
         :param layer: of each point (P,).
         """
         place = (points - self._origin) * self._scale

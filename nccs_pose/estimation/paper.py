@@ -15,17 +15,18 @@
 
 Section III of Mateus, Miraldo and Lima; a named baseline, not what the localiser uses. Lines go
 from the world to the mirror frame by p^C = R p^W + t with R a turn by theta about the mirror's
-axis and t_z known (eqs. 15 and 16), which makes the curve of each mirror point a polynomial
+axis and t_z known (eq. 15, eq. 16), which makes the curve of each mirror point a polynomial
 
     gamma_r(c, s, t_x, t_y) = E^2 (P^2 + W Q^2),   P of degree 2 (9 monomials), Q of degree 1 (4)
 
-of degree 4 (47 monomials, eq. 19). The problem (eq. 21) is
+of degree 4 (47 monomials; eq. 17, eq. 19). The problem (eq. 21) is
 
     min mean |gamma_r|   s.t.   g_1 = c^2 + s^2 - 1 = 0,   g_2 = mean (x - P / Q)^2 = 0
 
 solved by SLSQP with analytic gradients in the place of MATLAB's fmincon, from a first guess; the
-inverse transform at the end (eq. 22) gives T_map_base. What the print leaves open: g_2 is summed
-over the points, and the overall scale of gamma_r is set to 1 at the start, which moves no minimum.
+inverse transform at the end (eq. 22) gives T_map_base. What the print leaves open: g_2 is the
+mean over the points, and the overall scale of gamma_r is set to 1 at the start, which moves no
+minimum.
 With noise g_2 = 0 has no solution, hence the option to leave it out. As printed, the points weigh
 by the sizes of their polynomials, which differ by orders of magnitude over a mirror; dividing each
 by the norm of its coefficients, which the paper does not do, is the other option.
@@ -53,6 +54,7 @@ from scipy.optimize import minimize
 # (c, s, t_x, t_y) that each monomial of P is the product of: c^2 + s^2 stays unsubstituted.
 P_MONOMIALS = ('cc', 'ss', 'cx', 'sx', 'cy', 'sy', 'c', 's', 'x')
 Q_MONOMIALS = ('c', 's', 'y', '1')
+_MOST_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class PaperEstimate:
     """What the paper's problem ended in.
 
     :ivar pose: T_map_base.
-    :ivar theta: turn from the world to the camera frame, radians (the paper's R).
+    :ivar theta: turn from the world to the camera frame, radians (the paper's R, eq. 15).
     :ivar translation: (t_x, t_y, t_z) from the world to the camera frame, metres (the paper's t).
     :ivar objective: mean |gamma_r|, of its value at the start.
     :ivar g1: c^2 + s^2 - 1 where it ended.
@@ -192,7 +194,7 @@ class PaperProblem:
         return p, self.q_rows @ (c, s, t_y, 1.0), self.p_rows @ slopes
 
     def gamma_r(self, parameters: Array) -> tuple[Array, Array]:
-        """gamma_r (M,) (eq. 19) and its gradient by (c, s, t_x, t_y) (M, 4)."""
+        """gamma_r (M,) (eq. 17, eq. 19) and its gradient by (c, s, t_x, t_y) (M, 4)."""
         p, q, dp = self._p_and_q(*parameters.tolist())
         square = self.E**2
         gamma = square * (p * p + self.W * q * q)
@@ -221,7 +223,6 @@ def paper_estimate(
     *,
     use_g2: bool = True,
     normalised: bool = False,
-    max_iterations: int = 100,
 ) -> PaperEstimate:
     """The pose by the paper's problem (eq. 21).
 
@@ -251,12 +252,10 @@ def paper_estimate(
     if not hit.all():
         raise EstimationError(f'{int((~hit).sum())} of {len(pixels)} pixels miss the mirror')
     problem = PaperProblem(rig, points, directions, moments, normalised=normalised)
-    return _solve(problem, start, use_g2, max_iterations)
+    return _solve(problem, start, use_g2)
 
 
-def _solve(
-    problem: PaperProblem, start: Pose2, use_g2: bool, max_iterations: int,
-) -> PaperEstimate:
+def _solve(problem: PaperProblem, start: Pose2, use_g2: bool) -> PaperEstimate:
     first = problem.frame.parameters(start)
     scale = float(np.abs(problem.gamma_r(first)[0]).mean())
     scale = scale if scale > 0.0 else 1.0
@@ -285,7 +284,7 @@ def _solve(
             'jac': lambda v: problem.g2(v)[1] / unit})
     result = minimize(
         objective, first, jac=True, method='SLSQP', constraints=constraints,
-        options={'maxiter': max_iterations, 'ftol': 1e-12})
+        options={'maxiter': _MOST_ITERATIONS, 'ftol': 1e-12})
     # Where the constraints cannot be met SLSQP may give back its start: take the best it saw.
     found: Array = result.x if result.success else best
     if not np.isfinite(found).all() or math.hypot(found[0], found[1]) < 1e-12:
@@ -298,4 +297,5 @@ def _solve(
 
 
 def _g1(parameters: Array) -> float:
+    """c^2 + s^2 - 1 (eq. 18)."""
     return float(parameters[0] ** 2 + parameters[1] ** 2 - 1.0)

@@ -21,8 +21,9 @@ seen from base_link, the side operator of a reflected ray (r, w) and a line (d, 
         + s [r_x mu_y - r_y mu_x + w_x d_y - w_y d_x]
         - x r_z d_y + y r_z d_x  +  p r_y d_z - q r_x d_z  +  r_z mu_z + w_z d_z
 
-so that the squares of S over any number of pixels are one 7 x 7 Gram matrix. Horizontal lines
-have no p, q; vertical lines have no x, y. Everything here works on sums of squares of that form.
+so that the squares of S over any number of pixels are one 7 x 7 Gram matrix, by rows and columns
+of (c, s, x, y, p, q, 1). Horizontal lines have no p, q; vertical lines have no x, y. Everything
+here works on sums of squares of that form.
 """
 
 from __future__ import annotations
@@ -34,9 +35,6 @@ from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
 import numpy as np
 from numpy.typing import NDArray
-
-# Rows and columns of the Gram matrix.
-MONOMIALS = ('c', 's', 'x', 'y', 'p', 'q', '1')
 
 
 @dataclass(frozen=True)

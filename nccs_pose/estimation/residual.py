@@ -16,9 +16,11 @@
 
 S = r . mu + w . d is the Plücker side operator (reciprocal product) of the reflected ray (r, w)
 and the line (d, mu): zero just when they meet. On the mirror the paper's curve is
-gamma = E^2 S(x, y, z) S(-x, y, z) (eq. 12 factored), so S keeps the branch that is physical and
-drops the mirrored and the spurious one. Divided by |dS/d(u, v)| it is the distance in the image,
-to first order, from the pixel to the line's reflection curve (Sampson).
+gamma = E^2 S(x, y, z) S(-x, y, z) (eq. 13 factored), so S keeps the branch that is physical and
+drops the mirrored and the spurious one. (There S is that of a ray which is not of unit length and
+a line of the other sense: P - x Q = -N |v_i| S, see :mod:`nccs_pose.geometry.reflection_curve`.)
+Divided by |dS/d(u, v)| it is the distance in the image, to first order, from the pixel to the
+line's reflection curve (Sampson).
 
 Rays are in base_link, lines in the map; the pose is T_map_base.
 """
@@ -60,9 +62,10 @@ def check_rays_and_lines(rays: Rays, directions: Array, moments: Array, sigma: A
 
 
 def lines_in_base(directions: Array, moments: Array, pose: Pose2) -> tuple[Array, Array]:
-    """Plücker coordinates in base_link of map lines (N, 3), (N, 3) (the paper's eq. 15).
+    """Plücker coordinates in base_link of map lines (N, 3), (N, 3).
 
-    d' = R^T d and mu' = R^T (mu - p x d).
+    d' = R^T d and mu' = R^T (mu - p x d), with R and p of T_map_base: the paper's eq. 16, whose
+    (R, t) is the inverse motion.
     """
     rotation = pose.rotation
     return directions @ rotation, (moments - np.cross(pose.translation, directions)) @ rotation
@@ -76,13 +79,6 @@ def side(rays: Rays, directions: Array, moments: Array, pose: Pose2) -> Array:
     """
     d, mu = lines_in_base(directions, moments, pose)
     return np.einsum('ni,ni->n', rays.direction, mu) + np.einsum('ni,ni->n', rays.moment, d)
-
-
-def side_gradient(rays: Rays, directions: Array, moments: Array, pose: Pose2) -> Array:
-    """dS/d(u, v) (N, 2), metres per pixel."""
-    d, mu = lines_in_base(directions, moments, pose)
-    return (np.einsum('nij,ni->nj', rays.direction_jacobian, mu)
-            + np.einsum('nij,ni->nj', rays.moment_jacobian, d))
 
 
 def whitened_residual(

@@ -26,17 +26,13 @@ from functools import cache
 
 from nccs_pose.estimation.common_errors import common_variance
 from nccs_pose.estimation.refine import Refinement
+from nccs_pose.estimation.robust import CAUCHY, GATE, robust_variance, VAGUE_INFORMATION
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import definite_solution
 from nccs_pose.vision.bands import runs
-from nccs_pose.vision.median import upper_median
 import numpy as np
 from numpy.typing import NDArray
 
-# Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
-_CAUCHY = 2.385
-# Beyond this many robust standard deviations a group of stations is no inlier.
-_GATE = 3.0
 # Tukey's biweight forgets what lies beyond this many, and keeps 98 % of the efficiency under
 # Gaussian noise. No group weighs nothing at all, so that no sum is empty.
 _FORGOTTEN = 6.0
@@ -48,8 +44,6 @@ _ITERATIONS = 8
 # the pose, the next is about a fifth of it, and moves no group's residual by as much as a tenth of
 # its own.
 _FOUND = 1.0
-# Where the lines say nothing the pose is still somewhere within 100 m and 10 rad.
-_VAGUE = np.diag([1e-4, 1e-4, 1e-2])
 _ONE = np.eye(6)
 
 
@@ -161,7 +155,7 @@ def weigh_shifts(
     first, members = runs(group)
     # The sum of each group's columns as one whitened column.
     square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
-    inlier = (square <= _GATE**2).repeat(members)
+    inlier = (square <= GATE**2).repeat(members)
     root = np.maximum(1.0 - square / _FORGOTTEN**2, _NOTHING).repeat(members)
     image_sigma = None
     if calibration_sigma > 0.0 and image_shift is not None:
@@ -182,7 +176,7 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
     e = equations[-1]
     for _ in range(_ITERATIONS):
         square = e * e
-        width = _CAUCHY**2 * _robust_variance(square)
+        width = CAUCHY**2 * robust_variance(square)
         weight = width / (width + square)
         weighed = (equations * weight).dot(equations.T)
         normal = weighed[:-1, :-1] + known
@@ -193,7 +187,7 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
         if step.dot(normal).dot(step) < _FOUND:
             break
     square = np.square(e, dtype=float)
-    square /= _robust_variance(square)
+    square /= robust_variance(square)
     return square
 
 
@@ -218,15 +212,10 @@ def _unknowns(height: float, tilt: float) -> tuple[NDArray[np.intp], Array]:
     """Free unknowns (K,) with these deviations, and the information about them (K, K)."""
     sigmas = np.array([height, tilt, tilt])
     free = np.array([0, 1, 2, *(3 + np.flatnonzero(sigmas > 0.0))], dtype=np.intp)
-    information = np.diag([*np.diag(_VAGUE), *sigmas[sigmas > 0.0]**-2.0])
+    information = np.diag([*np.diag(VAGUE_INFORMATION), *sigmas[sigmas > 0.0]**-2.0])
     return free, information
 
 
 def _residual(rows: Array, unknowns: NDArray[np.floating]) -> Array:
     """Of equations (K + 1, N) at the unknowns (K,)."""
     return rows[-1] - unknowns.dot(rows[:-1])
-
-
-def _robust_variance(square: Array) -> float:
-    """Of the bulk of whitened residuals by their squares (N,), never below the noise told."""
-    return max(1.0, 1.4826**2 * upper_median(square))

@@ -15,8 +15,8 @@
 """The residual of many pixels, prepared once and evaluated at many poses.
 
 S is linear in the ray (r, w) and in seven monomials of the pose. So are its derivatives by the
-pixel, by the base's height, roll and pitch, and the cosine between ray and line: each is S of
-another ray. All are rows of one array, and a pose costs one small matrix product.
+pixel and the cosine between ray and line: each is S of another ray. All are rows of one array, and
+a pose costs one small matrix product.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ import numpy as np
 
 
 class SideForm:
-    """Whitened residuals of N rays against N lines, as functions of pose and attitude."""
+    """Whitened residuals of N rays against N lines, as functions of the pose."""
 
     def __init__(
         self, rays: Rays, directions: Array, moments: Array, sigma: Array | float,
-        sigma_world: float, with_attitude: bool,
+        sigma_world: float,
     ) -> None:
         """Prepare the rows.
 
@@ -40,20 +40,10 @@ class SideForm:
         :param moments: their moments (N, 3), metres.
         :param sigma: standard deviation of the pixels along the curve's normal, px, (N,) or one.
         :param sigma_world: standard deviation of the lines' own position, metres.
-        :param with_attitude: whether height, roll and pitch are unknowns too.
         """
-        self._with_attitude, self._in_world = with_attitude, sigma_world > 0.0
-        ray = with_derivatives(rays, 3 * with_attitude + self._in_world)
+        self._in_world = sigma_world > 0.0
+        ray = with_derivatives(rays, int(self._in_world))
         ray[:, 1:3] *= sigma
-        self._sigma = sigma
-        r_x, r_y, r_z, w_x, w_y, w_z = ray[:, 0]
-        if with_attitude:
-            # A base that rises or turns by a little moves its rays: w by e_z x r; r and w by
-            # e_x x, and by e_y x.
-            ray[:, 3:6] = 0.0
-            ray[3, 3], ray[4, 3] = -r_y, r_x
-            ray[1, 4], ray[2, 4], ray[4, 4], ray[5, 4] = -r_z, r_y, -w_z, w_y
-            ray[0, 5], ray[2, 5], ray[3, 5], ray[5, 5] = r_z, -r_x, w_z, -w_x
         if self._in_world:
             # S of (0, r) is the cosine between ray and line.
             ray[:3, -1], ray[3:, -1] = 0.0, sigma_world * ray[:3, 0]
@@ -62,14 +52,13 @@ class SideForm:
         self._world_variance = sigma_world**2
 
     def residual(self, unknowns: Array) -> tuple[Array, Array]:
-        """Residuals e (N,) and their Jacobian (N, 3), or (N, 6) with the attitude.
+        """Residuals e (N,) and their Jacobian (N, 3).
 
-        e = S / sqrt(sigma^2 |dS/du|^2 + sigma_w^2 |r x d|^2). The attitude is small: S is taken
-        as linear in it, and its effect on the weight is left out.
+        e = S / sqrt(sigma^2 |dS/du|^2 + sigma_w^2 |r x d|^2).
 
-        :param unknowns: (x, y, yaw), followed by (z, roll, pitch) with the attitude.
+        :param unknowns: (x, y, yaw).
         """
-        form = monomials_and_slopes(*unknowns[:3].tolist())
+        form = monomials_and_slopes(*unknowns.tolist())
         values = (form @ self._rows.reshape(7, -1)).reshape(4, *self._rows.shape[1:])
         s, gradient = values[:, 0], values[:, 1:3]
         # The variance, and half its slopes by the pose.
@@ -82,18 +71,6 @@ class SideForm:
         variance = np.maximum(variances[0], 1e-30)
         scale = 1.0 / np.sqrt(variance)
         e = s[0] * scale
-        if self._with_attitude:
-            e += unknowns[3:] @ values[0, 3:6] * scale
-        jacobian = np.empty((6 if self._with_attitude else 3, len(e)))
-        np.multiply(s[1:], scale, out=jacobian[:3])
-        jacobian[:3] -= variances[1:] * (e / variance)
-        if self._with_attitude:
-            np.multiply(values[0, 3:6], scale, out=jacobian[3:])
+        jacobian = s[1:] * scale
+        jacobian -= variances[1:] * (e / variance)
         return e, jacobian.T
-
-    def image_shift(self, unknowns: Array) -> Array:
-        """de/d(u, v) (N, 2): what a shift of the whole image does to the residuals."""
-        form = monomials_and_slopes(*unknowns[:3].tolist())[0]
-        gradient = (form @ self._rows[:, 1:3].reshape(7, -1)).reshape(2, -1)
-        variance = (gradient * gradient).sum(axis=0)
-        return (gradient / (self._sigma * np.sqrt(np.maximum(variance, 1e-30)))).T

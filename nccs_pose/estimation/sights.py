@@ -93,6 +93,8 @@ def sights(
 
     What is given is to be tried before the next is asked for.
 
+    :param image: (H, W, 3) uint8 BGR.
+    :param colours: what tapes look like to begin with.
     :param in_vain: how many images before this one were searched and showed nothing; the groups of
         further looks take turns.
     :param told: where the robot is by something else than the image.

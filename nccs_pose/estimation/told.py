@@ -45,7 +45,10 @@ class Told:
     gate: float
 
     def holds(self, pose: Pose2, covariance: Array = _GUESSED) -> bool:
-        """Whether a pose is there, as sure as its own covariance; that of a guess by strips."""
+        """Whether a pose is there, as sure as its own covariance.
+
+        :param covariance: of its (x, y, yaw) (3, 3); unless given, that of a guess by strips.
+        """
         return close(pose, self.pose, self.covariance + covariance, self.gate)
 
     def holds_guesses(self, places: Complex, rotations: Complex) -> NDArray[np.bool_]:

@@ -52,7 +52,7 @@ class ExperimentOptions:
     length: float = option(
         3.0, doc='Length of the lines that the points are taken from.', unit='m', low=0.01,
         high=1000.0)
-    start_angle: float = option(
+    start_angle_deg: float = option(
         10.0, doc="The paper's estimator starts within this of the true yaw.", unit='deg',
         low=0.0, high=180.0)
     start_distance: float = option(
@@ -62,7 +62,7 @@ class ExperimentOptions:
         False, doc="Leave the paper's two estimators out, which take most of the time.")
     normalised: bool = option(
         False, doc='Normalise gamma_r point by point, which the paper does not.')
-    failure_angle: float = option(
+    failure_angle_deg: float = option(
         5.0, doc='A larger rotation error counts as a failure.', unit='deg', low=0.0, high=180.0)
     failure_distance: float = option(
         0.5, doc='A larger translation error counts as a failure.', unit='m', low=0.0,

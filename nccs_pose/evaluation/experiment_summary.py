@@ -78,8 +78,8 @@ def summary_text(
         f'`{command(name, trials, options)}`: {trials} trials a cell. Medians of the absolute '
         'rotation error and of the norm of the translation error; "× bound" is √(median NEES / '
         '2.366), 1 for an estimator at the Cramér–Rao bound; failures are errors beyond '
-        f'{options.failure_angle:g}° or {options.failure_distance:g} m. "bound" is a draw from '
-        'the bound itself, which shows the chance in the other numbers.\n']
+        f'{options.failure_angle_deg:g}° or {options.failure_distance:g} m. "bound" is a draw '
+        'from the bound itself, which shows the chance in the other numbers.\n']
     for mirror in dict.fromkeys(cell.mirror for cell, _ in results):
         parts.append(f'## {mirror.capitalize()} mirror\n')
         rows = [['level', 'lines × points', 'estimator', 'rotation (°)', 'translation (mm)',

@@ -116,7 +116,7 @@ class Answer:
     def failed(self, options: ExperimentOptions) -> bool:
         """Whether it is farther off than the limits of a failure, or not there."""
         return (
-            self.rotation_deg > options.failure_angle
+            self.rotation_deg > options.failure_angle_deg
             or self.translation > options.failure_distance)
 
 
@@ -181,7 +181,7 @@ def _answer(name: str, pose: Pose2 | None, truth: Pose2, bound: Array | None) ->
 def make_data_set(
     rig: Rig, options: ExperimentOptions, cell: Cell, rng: np.random.Generator,
 ) -> DataSet:
-    """Random lines, a random pose, noisy pixels.
+    """Random lines (the paper's eq. 23), a random pose, noisy pixels.
 
     :raises SimulationError: if the rig hardly sees any line of this range.
     """
@@ -189,7 +189,7 @@ def make_data_set(
     truth = Pose2(x, y, rng.uniform(-math.pi, math.pi))
     # a uniform direction and distance, so that the start is anywhere in the disc
     angle, distance = rng.uniform(-math.pi, math.pi), math.sqrt(rng.uniform())
-    reach, turn = (3.0, 180.0) if cell.blind else (options.start_distance, options.start_angle)
+    reach, turn = (3.0, 180.0) if cell.blind else (options.start_distance, options.start_angle_deg)
     start = Pose2(
         truth.x + reach * distance * math.cos(angle), truth.y + reach * distance * math.sin(angle),
         truth.yaw + math.radians(turn) * rng.uniform(-1.0, 1.0))

@@ -92,13 +92,13 @@ class MirrorPolynomials:
     """What depends on mirror and camera only, as polynomials in the mirror point's (y, z).
 
     :ivar h: A z + B/2, the normal's z.
-    :ivar s: z of k - o, with k = m - n on the mirror's axis.
+    :ivar s: z of k - o, with k = m - n on the mirror's axis (eq. 5, its sign of B put right).
     :ivar W: y^2 + A z^2 + B z - C; x^2 = -W on the mirror.
     :ivar N: n.n on the mirror.
     :ivar L: v_i.n on the mirror, the polar plane of o.
     :ivar E: s y + o_y h; zero where o, k and m are in line in the plane x = 0.
     :ivar v_y: y of the reflected ray, N v_i - 2 n L (eq. 10 over 4).
-    :ivar v_z: z of the reflected ray.
+    :ivar v_z: z of the reflected ray; v_i = m - o (eq. 11).
     """
 
     h: Bivariate
@@ -174,7 +174,7 @@ def paper_polynomials(
     base = mirror_polynomials(mirror, o)
     y, z, one = _poly((1, 0, 1.0)), _poly((0, 1, 1.0)), _poly((0, 0, 1.0))
 
-    # eq. 6: p(lambda), k and o span the plane, m lies in it
+    # eq. 6: p(lambda), k and o span the plane (eq. 3), m lies in it
     c1 = d[1] * base.s + (d[2] * o[1]) * one
     c2 = (q[1] - o[1]) * base.s + (o[1] * (q[2] - o[2])) * one
     c3 = (-d[0]) * base.E
@@ -183,8 +183,8 @@ def paper_polynomials(
     c5 = c3 * c3 + base.W * c1 * c1
     c6 = 2.0 * (c3 * c4 + base.W * c1 * c2)
     c7 = c4 * c4 + base.W * c2 * c2
-    # eq. 12: the first component of v_r x (p - m), the one without x. The leading terms of
-    # v_y z - v_z y cancel, so it is written without them.
+    # eq. 12: the first component of v_r x (p - m) = 0 (eq. 8), the one without x. The leading
+    # terms of v_y z - v_z y cancel, so it is written without them.
     c8 = d[2] * base.v_y - d[1] * base.v_z
     across = base.N * (o[2] * y - o[1] * z) - 2.0 * base.L * y * (z - base.h)
     c9 = q[2] * base.v_y - q[1] * base.v_z - across

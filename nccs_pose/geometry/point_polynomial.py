@@ -108,7 +108,9 @@ class PointConditions:
         )
 
     def polynomial(self) -> Array:
-        """G(z), coefficients (N, 9) by falling power; (N, 7) with the camera on the axis.
+        """G(z), whose roots hold the heights of the mirror points, by falling power.
+
+        (N, 9) coefficients; (N, 7) with the camera on the axis.
 
         On the axis the points must already be turned about it into the plane x = 0.
         """
@@ -162,21 +164,6 @@ def _value(polynomial: Polynomial, z: Array) -> Array:
     for a in reversed(polynomial):
         total = total * z + a
     return total
-
-
-def reflection_polynomial(
-    quadric: tuple[float, float, float], cop: tuple[float, float], points: Array
-) -> Array:
-    """G(z) of every point, whose roots hold the height of its mirror point.
-
-    quadric (A, B, C), cop (o_y, o_z), points (N, 3) in the mirror frame, one unit of length.
-    Returns (N, 9) coefficients by falling power, (N, 7) where o_y = 0.
-    """
-    if cop[0] == 0.0:
-        points = np.column_stack(
-            [np.zeros(len(points)), np.hypot(points[:, 0], points[:, 1]), points[:, 2]]
-        )
-    return PointConditions(quadric, cop, points).polynomial()
 
 
 def real_roots(coefficients: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:

@@ -101,6 +101,7 @@ class _Scene:
         return -2 * r2 / np.where(total > 0.0, total, 1.0), root / 2
 
     def reflect(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Mirror points (N, 3) of points (N, 3), and which are visible (N,); all in metres."""
         p = (points - self.apex) / self.unit
         x, y = np.zeros(len(p)), np.zeros(len(p))
         found = np.zeros(len(p), dtype=bool)

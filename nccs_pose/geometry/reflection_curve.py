@@ -24,6 +24,9 @@ line q + lambda d and its moment mu = q x d,
 and on the mirror, where x^2 = -W, gamma = E^2 S(x, y, z) S(-x, y, z) with S = P - x Q, the Plücker
 side operator of reflected ray and line. So gamma vanishes on more than the line's image, and the
 paper's "if and only if" (after its eq. 14) does not hold: see :class:`Branch`.
+
+Its ray is the polynomial v_r, N |v_i| long, and its sign is that of the polynomials. The S of a
+unit ray, the estimator's (:mod:`nccs_pose.estimation.residual`), differs: P - x Q = -N |v_i| S.
 """
 
 from __future__ import annotations
@@ -130,7 +133,10 @@ class ReflectionCurve:
             return p / q
 
     def side(self, points: Array) -> Array:
-        """S = P - x Q at mirror points (N, 3): zero where the reflected ray meets the line."""
+        """S = P - x Q at mirror points (N, 3): zero where the reflected ray meets the line.
+
+        It is -N |v_i| times S of the unit ray, in metres to the fourth.
+        """
         _, p, q, _ = self.factors(points[:, 1], points[:, 2])
         return p - points[:, 0] * q
 

@@ -118,7 +118,7 @@ class Rig:
         """Reflected rays in base_link of pixels (N, 2), with exact derivatives by the pixel.
 
         Incident ray v, mirror point m, normal n, reflected ray r = v - 2 n (v.n)/(n.n)
-        (the paper's eqs. 8 to 10).
+        (the paper's eq. 9; eq. 10 is the same without the division, eq. 11 is v).
         """
         seen, slopes = self.camera.directions_with_jacobian(np.asarray(pixels, dtype=float))
         # Components first, then value and derivatives by u and v, (3, 3, N): what is done to all

@@ -104,7 +104,7 @@ def inverse_3x3(matrix: Array) -> Array | None:
 
 
 def inverse(matrix: Array) -> Array:
-    """Inverse of any regular, symmetric matrix."""
+    """Inverse (P, P) of any regular, symmetric matrix (P, P)."""
     found = inverse_3x3(matrix) if len(matrix) == 3 else None
     return np.asarray(np.linalg.inv(matrix), dtype=float) if found is None else found
 

@@ -58,20 +58,6 @@ class Trajectory(Protocol):
         """Give its velocity, consistent with the poses."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Arc:
-    """Constant twist: a circle, a straight line, a turn on the spot, or rest."""
-
-    start: Pose2
-    velocity: Twist
-
-    def pose(self, t: float) -> Pose2:
-        return integrate_twist(self.start, self.velocity, t)
-
-    def twist(self, t: float) -> Twist:
-        return self.velocity
-
-
 class Loop:
     """A closed smooth track through waypoints, driven again and again at one speed.
 
@@ -103,11 +89,6 @@ class Loop:
         self._knots = np.linspace(0.0, knots[-1], 200 * len(points) + 1)
         self._lengths = self._measure(self._knots)
         self.length = float(self._lengths[-1])
-
-    @property
-    def period(self) -> float:
-        """Time for one round, s."""
-        return self.length / self.speed
 
     def _measure(self, knots: np.ndarray) -> np.ndarray:
         """Length of the track up to each knot, by Gauss-Legendre over each piece."""

@@ -62,6 +62,8 @@ def read_pixels(
     All stations are read at one place of the grid before the next: what they show lies apart, so
     that the processor fetches it for several at a time.
 
+    :param image: (H, W, 3) uint8 BGR.
+    :param bands: of N stations.
     :param margin: beyond the edges, px.
     :param rows: of the grid along each station's piece of curve.
     """

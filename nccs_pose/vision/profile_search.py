@@ -38,6 +38,10 @@ def search_profiles(
     """The best match of each station's profile anywhere within ``reach`` pixels across.
 
     For a prediction that is several pixels off; good to about a pixel.
+
+    :param image: (H, W, 3) uint8 BGR.
+    :param bands: of N stations.
+    :returns: what was found of each (N,).
     """
     offsets, contrast, _ = contrast_across(image, bands, colour, reach)
     together = _TOGETHER if len(bands) > _TOGETHER else 1

@@ -87,7 +87,7 @@ def chromatic_mask(
 
 
 def brightness(image: NDArray[np.uint8]) -> float:
-    """How bright an image is, grey levels."""
+    """How bright an image (H, W, 3) uint8 BGR is, grey levels."""
     return upper_median(image[::8, ::8, 1])
 
 
@@ -124,6 +124,9 @@ def contrast_of(image: NDArray[np.uint8], colour: str) -> Mask:
     """A colour's contrast in each pixel, 128 (or the brightness, for white) where there is none.
 
     The mean of the channels that rise less that of those that fall, in whole grey levels.
+
+    :param image: (H, W, 3) uint8 BGR.
+    :returns: (H, W) uint8.
     """
     channels = cv2.split(image)
     rising, falling = ([channel for channel, sign in zip(channels, CONTRASTS[colour])
@@ -145,6 +148,8 @@ def _mean(channels: list[Mask]) -> Mask:
 def hsv_mask(image: NDArray[np.uint8], colour: str) -> Mask:
     """Where hue, saturation and value lie in the colour's fixed ranges: the paper's threshold.
 
+    :param image: (H, W, 3) uint8 BGR.
+    :returns: (H, W) uint8, 255 where they do.
     :raises VisionError: if the colour has no hue.
     """
     if colour not in _HSV_RANGES:
