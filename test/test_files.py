@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -22,7 +24,8 @@ import sys
 from calibration_reader import read_calibration
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.saved_pose import read_saved_pose
+from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.trajectories import read_tum, write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
 from nccs_pose.geometry.rig import Rig
@@ -193,6 +196,46 @@ def test_text_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert not Path('/dev/null').is_file()
     with pytest.raises(FileError, match=r'b\.txt.*cannot be written'):
         write_text(tmp_path / 'new' / 'a.txt' / 'b.txt', 'x')
+
+
+@pytest.mark.parametrize('read', [load_rig, load_map, read_tum, read_saved_pose])
+def test_only_regular_files_of_some_size_are_read(
+    read: Callable[[Path], object], tmp_path: Path,
+) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'endless').symlink_to('/dev/zero')
+    for name in ('pipe', 'endless'):
+        assert 'cannot be read: it is a pipe or a device' in refusal(
+            read, tmp_path / name)
+    with (tmp_path / 'large').open('wb') as file:
+        file.truncate(2**28 + 1)
+    assert 'cannot be read: it has more than' in refusal(read, tmp_path / 'large')
+    assert 'File name too long' in refusal(read, tmp_path / ('x' * 300))
+
+
+def test_what_cannot_be_written_is_said_before_and_after(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+
+    def write(path: Path) -> None:
+        write_text(path, 'text')
+
+    for path, words in (
+            (tmp_path / ('x' * 250), 'File name too long'),
+            (tmp_path / ('x' * 300) / 'a', 'File name too long'),
+            (Path('/proc/nowhere/a'), 'cannot be written: No such file')):
+        assert words in refusal(check_writable, path)
+        assert words in refusal(write, path)
+    assert 'folder' in refusal(check_writable, tmp_path)
+    # Nobody reads it: to wait for a reader would be to hang.
+    assert 'cannot be written' in refusal(write, tmp_path / 'pipe')
+    check_writable('/dev/null')
+    check_writable(tmp_path / 'fine')
+    assert [path.name for path in tmp_path.iterdir()] == ['pipe']
+
+
+def test_a_name_in_another_encoding_is_written_as_an_escape(tmp_path: Path) -> None:
+    write_text(tmp_path / 'a', '# of re\udcfe\n')
+    assert (tmp_path / 'a').read_text(encoding='utf-8') == '# of re\\udcfe\n'
 
 
 def example_trajectory() -> Trajectory:

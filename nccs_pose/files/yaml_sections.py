@@ -27,10 +27,12 @@ import re
 from typing import Any
 
 from nccs_pose.errors import FileError
+from nccs_pose.files.text_files import read_text
 import numpy as np
 import yaml
 
 _REQUIRED: Any = object()
+_LARGEST = 2**23  # bytes; a map of a thousand lines has a hundredth of it
 
 
 class _CoreLoader(yaml.SafeLoader):
@@ -81,11 +83,7 @@ def read_yaml(path: str | Path) -> Section:
         file and line.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not UTF-8 text'
-        raise FileError(f'{path}: cannot be read: {reason}.') from error
+    text = read_text(path, _LARGEST)
     try:
         content = yaml.load(text, Loader=_CoreLoader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
