@@ -73,7 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = _options(args)
-    check_writable(args.output)
+    for ending in (args.output.suffix, '.map.yaml', '.report.md', '.residuals_image.png'):
+        check_writable(args.output.with_suffix(ending))
     images = DriveImages(args.bag, args.images, args.image_topic)
     images.check_size(rig.camera)
     if args.from_rim:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from nccs_pose.argument_types import whole
+from nccs_pose.argument_types import number, whole
 from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
 from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rig', type=Path, required=True, help='the rig to check (YAML)')
     parser.add_argument('--map', type=Path, required=True, help='map of the lines (YAML)')
     parser.add_argument(
-        '--pose-error', type=float, default=5.0, metavar='MM',
+        '--pose-error', type=number(0.01, 1000.0, 'mm'), default=5.0, metavar='MM',
         help='pose error that matters, mm (default %(default)s)')
     parser.add_argument('--images', type=whole(1), default=150, metavar='N',
                         help='look at this many images at most (default %(default)s)')

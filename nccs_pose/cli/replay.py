@@ -49,8 +49,8 @@ from nccs_pose.evaluation.metrics import (
 from nccs_pose.evaluation.tables import as_numbers, consistency_table, summary_table
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagTopics
-from nccs_pose.files.pictures import save_figure, save_image
-from nccs_pose.files.text_files import check_writable, write_text
+from nccs_pose.files.pictures import as_title, save_figure, save_image
+from nccs_pose.files.text_files import check_writable, read_text, write_text
 from nccs_pose.files.trajectories import write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.camera import PinholeCamera
@@ -62,6 +62,7 @@ import numpy as np
 
 _METHODS: dict[str, Callable[[Rig, LineMap, LocaliserOptions], Answering]] = {
     'nccs': Localiser, 'paper': PaperLocaliser}
+_ENDINGS = ('frames.jsonl', 'run.json', 'evaluation.json')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,7 +98,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = make_options(args.params, args.option)
-    check_writable(args.output)
+    for path in (args.output, *(_beside(args.output, ending) for ending in _ENDINGS)):
+        check_writable(path)
+    if args.plots:
+        check_writable(args.plots / 'trajectory.png')
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:
@@ -207,7 +211,7 @@ def _draw_trajectory(
     from nccs_pose.evaluation.plots import trajectory_figure
 
     save_figure(
-        trajectory_figure(estimated, truth, line_map, str(args.bag)),
+        trajectory_figure(estimated, truth, line_map, as_title(args.bag)),
         args.plots / 'trajectory.png')
 
 
@@ -216,8 +220,8 @@ def _draw_errors(
 ) -> None:
     from nccs_pose.evaluation.plots import error_figure, histogram_figure
 
-    save_figure(error_figure(errors, covariances, str(args.bag)), args.plots / 'errors.png')
-    save_figure(histogram_figure(errors, str(args.bag)), args.plots / 'histogram.png')
+    save_figure(error_figure(errors, covariances, as_title(args.bag)), args.plots / 'errors.png')
+    save_figure(histogram_figure(errors, as_title(args.bag)), args.plots / 'histogram.png')
 
 
 def _print_states(records: list[FrameRecord]) -> None:
@@ -242,8 +246,8 @@ def _used(args: argparse.Namespace, options: LocaliserOptions, topics: dict[str,
     return json.dumps({
         'command': 'replay', 'method': args.method, 'bag': str(args.bag), 'topics': topics,
         'odometry': not args.no_odometry, 'options': dataclasses.asdict(options),
-        'rig': {'file': str(args.rig), 'text': args.rig.read_text(encoding='utf-8')},
-        'map': {'file': str(args.map), 'text': args.map.read_text(encoding='utf-8')},
+        'rig': {'file': str(args.rig), 'text': read_text(args.rig)},
+        'map': {'file': str(args.map), 'text': read_text(args.map)},
     }, indent=2) + '\n'
 
 
