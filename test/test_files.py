@@ -20,6 +20,7 @@ import os
 from pathlib import Path
 import subprocess
 import sys
+import time
 
 from calibration_reader import read_calibration
 from nccs_pose.errors import FileError
@@ -28,6 +29,7 @@ from nccs_pose.files.saved_pose import read_saved_pose
 from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.trajectories import read_tum, write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
+from nccs_pose.files.yaml_sections import read_yaml
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 import pytest
@@ -102,9 +104,9 @@ lines:
   - {name: "it's: no", start: [0.1, 0, 0.5], end: [.5, 2, 0.5], width: 5e-2, colour: green}
   - {start: [0, 0, 0], end: [0, 0, 2], width: 0, name: "null"}
 """
-    line_map = load_map(map_file(tmp_path, text))
+    line_map = load_map(map_file(tmp_path, text), tapes=False)
     save_map(line_map, tmp_path / 'again.yaml', comment='saved')
-    again = load_map(tmp_path / 'again.yaml')
+    again = load_map(tmp_path / 'again.yaml', tapes=False)
     assert line_map.frame == again.frame == 'arena'
     assert [line.name for line in again] == ['line0', "it's: no", 'null']
     assert [line.colour for line in again] == ['red', 'green', 'red']
@@ -124,7 +126,7 @@ lines:
     ('A: 1.0', 'A: 1.0\n  A: 1.0', ['line', "'A'", 'twice']),
     ('C: 0.001024', 'C: -0.001024', ['mirror', '-0.001024']),
     ('width: 960', 'width: 960.5', ['camera.width', 'whole number', '960.5']),
-    ('height: 720', 'height: 0', ['camera.height', 'above 0', '0']),
+    ('height: 720', 'height: 0', ['camera.height', '1 to 16384', '0']),
     ('K: [588.75, ', 'K: [', ['camera.K', '9 numbers', '8']),
     ('K: [588.75, 0.0', 'K: [588.75, 7.5', ['camera.K', '7.5']),
     ('K: [588.75', 'K: [-588.75', ['camera.K', 'above 0', '-588.75']),
@@ -139,6 +141,12 @@ lines:
     ('mounting:', 'mountings:', ['mounting', 'missing', 'is mountings meant?']),
     ('rpy: [3.1485739705977704, ', 'rpy: [', ['mounting.rpy', '3 numbers', '2']),
     ('mirror:', 'mirror: [1', ['line']),
+    ('A: 1.0', 'A: 1e150', ['mirror.A', 'at most 1e+07', '1e+150']),
+    ('B: 0.0', 'B: 1e300', ['mirror.B', 'at most 1e+07', '1e+300']),
+    ('rim_radius: 0.032', 'rim_radius: 1e300', ['mirror.rim_radius', 'at most 1e+07']),
+    ('0.75]', '1e300]', ['mounting.translation[2]', 'at most 1e+07']),
+    ('0.75]', '-0.75]', ['mounting.translation[2]', 'above 0', 'floor', '-0.75']),
+    ('width: 960', 'width: 1000000', ['camera.width', '1 to 16384', '1000000']),
 ])
 def test_a_wrong_rig_is_refused_by_key_and_value(
     tmp_path: Path, old: str, new: str, words: list[str],
@@ -161,6 +169,13 @@ def test_a_wrong_rig_is_refused_by_key_and_value(
      ['again', 'south', 'once more']),
     (MAP.replace('name: east', 'name: 7'), ['lines[1].name', '7', 'quotes']),
     (MAP.replace('width: 0.05', 'width: -0.05'), ['width', 'at least 0', '-0.05']),
+    (MAP.replace('width: 0.05', 'width: 1e300'), ['width', 'at most 1e+07', '1e+300']),
+    (MAP.replace('width: 0.05', 'width: 0'), ['lines[0]', 'south', 'no tape', 'above 0 m']),
+    (MAP.replace('-1.55]', '-1.55, 1]').replace('end: [1.25, -1.65]', 'end: [1.25, -1.65, 1]'),
+     ['lines[0]', 'south', 'no tape', 'not 1 and 1']),
+    (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, -1.65], colour: octarine'),
+     ['lines[0].colour', 'octarine', 'green, red']),
+    (MAP.replace('colour: green', 'colour: octarine'), ['colour', 'octarine', 'green, red']),
     (MAP.replace('width: 0.05', 'width: 5 cm'), ['width', 'number in m', '5 cm']),
     (MAP.replace('colour', 'color'), ['color', 'unknown', 'colour']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, -1.65, 0.3]'), ['lines[0]', 'horizontal']),
@@ -178,6 +193,22 @@ def test_a_wrong_map_is_refused_by_key_and_value(
     message = refusal(load_map, map_file(tmp_path, text))
     for word in words:
         assert word in message
+
+
+def test_a_thousand_lines_are_compared_at_once(tmp_path: Path) -> None:
+    ends = np.random.default_rng(0).uniform(-30.0, 30.0, (1000, 4)).round(3).tolist()
+    rows = [f'  - {{start: {e[:2]}, end: {e[2:]}}}\n' for e in ends]
+    path = map_file(tmp_path, f'width: 0.05\nlines:\n{"".join(rows)}')
+    begin = time.perf_counter()
+    read_yaml(path)
+    middle = time.perf_counter()
+    assert len(load_map(path)) == 1000
+    # A second is for a busy machine; of pairs compared one by one it were half a minute.
+    assert time.perf_counter() - middle < 1.0 + 3.0 * (middle - begin)
+    again = ', '.join(str(v + 9e-4) for v in ends[500][2:]), ', '.join(map(str, ends[500][:2]))
+    rows.append(f'  - {{name: again, start: [{again[0]}], end: [{again[1]}]}}\n')
+    message = refusal(load_map, map_file(tmp_path, f'width: 0.05\nlines:\n{"".join(rows)}'))
+    assert "lines[1000] (line 'again') is line 'line500' once more" in message
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
