@@ -155,7 +155,9 @@ def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_pa
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'rough_cop=wide'],
              "'wide' is no float"),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'tilt=1'],
-             'NAME=VALUE with a known NAME'),
+             "there is no option 'tilt'; there are rough_cop, "),
+            (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'rough_cop=0.2'],
+             'rough_cop = 0.2 m: must lie in [1e-06, 0.1]'),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--free-line', 'attic'],
              "'attic' cannot be freed"),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--from-rim'],
@@ -165,6 +167,13 @@ def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_pa
             'calibrate', str(drive), *arguments, '--output', str(tmp_path / 'out.yaml')])
         assert words in words_said
         assert not (tmp_path / 'out.yaml').exists()
+
+
+def test_help_explains_every_option(capsys):
+    assert main(['calibrate', '--help']) == 0
+    text = capsys.readouterr().out
+    assert '  rough_cop=0.003 m  (1e-06 to 0.1)\n      Of the centre of projection.\n' in text
+    assert '  max_frames=40  (3 to 100000)\n      Most frames that enter the fit.\n' in text
 
 
 def test_a_place_without_images_is_named(drive, tmp_path, capsys):

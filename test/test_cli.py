@@ -30,7 +30,7 @@ from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.parser import COMMANDS
 from nccs_pose.cli.progress import Progress
-from nccs_pose.errors import FileError
+from nccs_pose.errors import FileError, OptionError
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagWriter
@@ -266,6 +266,12 @@ talker:
     path.write_text(f'localiser: {{ros__parameters: {{{number.name}: {low - 1}}}}}')
     with pytest.raises(FileError, match=rf'params\.yaml: {number.name} = '):
         make_options(path, [])
+    for name in (number.name, 'window'):  # whole numbers that no float holds
+        path.write_text(f'localiser: {{ros__parameters: {{{name}: 1{"0" * 400}}}}}')
+        with pytest.raises(FileError, match=rf'params\.yaml: {name} = 10+.*: must lie in'):
+            make_options(path, [])
+    with pytest.raises(OptionError, match=r'--option window=10+: window = '):
+        make_options(None, [f'window=1{"0" * 400}'])
     path.write_text('talker: {ros__parameters: {}}')
     with pytest.raises(FileError, match=r'params\.yaml: localiser is missing'):
         make_options(path, [])
