@@ -28,9 +28,11 @@ import sys
 import cv2
 from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
+from nccs_pose.cli.paper_localiser import PaperLocaliser
 from nccs_pose.cli.parser import COMMANDS
 from nccs_pose.cli.progress import Progress
-from nccs_pose.errors import FileError, OptionError
+from nccs_pose.errors import FileError, FrameRefusedError, OptionError
+from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagWriter
@@ -144,6 +146,25 @@ def test_the_paper_s_chain_runs_over_the_same_bag_and_is_worse(
         assert ('nees' in numbers) == (method == 'nccs')  # the paper gives no covariance
         rmse[method] = numbers['translation_m']['rmse']
     assert 3.0 * rmse['nccs'] < rmse['paper'] < 0.3
+
+
+def test_the_paper_s_chain_refuses_the_images_that_the_localiser_refuses(drive: Path) -> None:
+    rig, line_map = load_rig(f'{drive}_rig.yaml'), load_map(f'{drive}_map.yaml')
+    with BagReader(drive) as bag:
+        images = [(event.stamp_ns, event.decode()) for event in bag.events(odometry=False)]
+    for localiser in (kind(rig, line_map, LocaliserOptions()) for kind in (
+            Localiser, PaperLocaliser)):
+        for stamp, image in images:
+            assert localiser.process(stamp, image).pose is not None
+        last, image = images[-1]
+        for wrong, cause in (
+                ((last, image), 'duplicate_stamp'), ((last - 10**8, image), 'out_of_order'),
+                ((last + 10**8, image[:-1]), 'image_size')):
+            with pytest.raises(FrameRefusedError) as refused:
+                localiser.process(*wrong)
+            assert refused.value.cause == cause
+        # A bag that is played again begins anew.
+        assert localiser.process(images[0][0] - 10**10, images[0][1]).pose is not None
 
 
 def test_rendering_twice_gives_the_same_bag(drive: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from nccs_pose.argument_types import number, whole
 from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
-from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
+from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions, Verdict
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
@@ -67,9 +67,17 @@ def run(args: argparse.Namespace) -> int:
         model = RigModel(rig, line_map)
         _print_structure(judge(model, model, measured.frames, measured.poses), line_map)
     print(f'structure against noise: {verdict.statistic:.0f} (noise alone stays below '
-          f'{verdict.limit:.0f})')
+          f'{verdict.limit:.0f}){_worth(verdict, options)}')
     print(verdict.words)
     return 0 if verdict.condition is Condition.GOOD else 1
+
+
+def _worth(verdict: Verdict, options: MonitorOptions) -> str:
+    """What structure that is no noise means for a calibration that is good all the same."""
+    if verdict.condition is not Condition.GOOD or verdict.statistic <= verdict.limit:
+        return ''
+    return (f': worth {1e3 * verdict.pose_error:.1f} mm in the poses, less than the '
+            f'{1e3 * options.pose_error:g} mm that matter (--pose-error)')
 
 
 def _print_structure(judged: Judgement, line_map: LineMap) -> None:
