@@ -217,6 +217,26 @@ def test_a_bag_in_which_no_frame_is_answered_ends_with_1(tmp_path: Path, capsys:
     assert 'tracking' not in out
 
 
+def test_odometry_that_the_node_would_refuse_is_used_and_said(
+    tmp_path: Path, capsys: Capture,
+) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for stamp in (10**9, 2 * 10**9):
+            writer.write_image(stamp, np.zeros((720, 960, 3), np.uint8), compression='png')
+            writer.write_odometry(stamp, Pose2(), frame_id='r1/odom', child_frame_id='r1/base')
+    call = ['replay', str(tmp_path / 'bag'), *ROOM, '--output', str(tmp_path / 'poses.tum')]
+    warning = said(capsys, call)[2]
+    assert warning.count('warning') == 1
+    assert "odometry of 'r1/base' in 'r1/odom' is used; the node takes that of 'base_link' in" in (
+        warning)
+    parameters = tmp_path / 'robot.yaml'
+    parameters.write_text(
+        'localiser: {ros__parameters: {frame_prefix: r1/, base_frame: base}}')
+    assert 'warning' not in said(capsys, [*call, '--params', str(parameters)])[2]
+    parameters.write_text('localiser: {ros__parameters: {odom_frame: 3}}')
+    assert 'robot.yaml: odom_frame = 3' in refusal(capsys, [*call, '--params', str(parameters)])
+
+
 def test_images_of_another_size_are_refused_one_by_one(tmp_path: Path, capsys: Capture) -> None:
     bag = black_bag(tmp_path / 'bag', (48, 64))
     code, out, _ = said(

@@ -28,6 +28,7 @@ from nccs_pose.options import check_value
 from nccs_pose.ros.node_options import NodeOptions
 
 _FIELDS = {field.name: field for field in dataclasses.fields(LocaliserOptions)}
+_FRAMES = ('odom_frame', 'base_frame', 'frame_prefix')
 
 
 def make_options(parameter_file: Path | None, settings: Iterable[str]) -> LocaliserOptions:
@@ -39,6 +40,20 @@ def make_options(parameter_file: Path | None, settings: Iterable[str]) -> Locali
     """
     values = _from_file(parameter_file) if parameter_file is not None else {}
     return LocaliserOptions(**(values | parse_settings(settings, _FIELDS)))
+
+
+def odometry_frames(parameter_file: Path | None) -> tuple[str, str]:
+    """In which frame, and of which, the node takes odometry: its defaults, or as a file says.
+
+    :raises FileError: if the file names no frames.
+    """
+    given = load_parameters(parameter_file, 'localiser') if parameter_file is not None else {}
+    frames = {name: given[name] for name in _FRAMES if name in given}
+    try:
+        node = NodeOptions(**frames)
+    except OptionError as error:
+        raise FileError(f'{parameter_file}: {error}.') from error
+    return node.odom, node.base
 
 
 def _from_file(path: Path) -> dict[str, Any]:
