@@ -28,9 +28,9 @@ import xml.etree.ElementTree as ElementTree
 
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import reference
 from nccs_pose.ros.interface import INPUTS, OUTPUTS
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np

@@ -24,8 +24,8 @@ from nccs_pose.cli.option_settings import parse_settings
 from nccs_pose.errors import FileError, OptionError
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.parameter_files import load_parameters
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.options import check_value
-from nccs_pose.ros.node_options import NodeOptions
 
 _FIELDS = {field.name: field for field in dataclasses.fields(LocaliserOptions)}
 _FRAMES = ('odom_frame', 'base_frame', 'frame_prefix')

@@ -30,8 +30,8 @@ from typing import Any
 from nccs_pose.estimation.estimate import State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.text_files import write_text
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.interface import CAUSES, Endpoint, INPUTS, OUTPUTS, SERVICES, STATUSES, TF_MODES
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.resources import share_directory
 
 HEAD = """\
