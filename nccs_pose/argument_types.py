@@ -20,6 +20,9 @@ import argparse
 from collections.abc import Callable
 import math
 
+WIDEST = 8192
+"""Pixels of a simulated image; a rendered frame then takes gigabytes."""
+
 
 def whole(low: int, high: int | None = None) -> Callable[[str], int]:
     """A whole number from `low` on, up to `high` if given."""
@@ -31,6 +34,29 @@ def whole(low: int, high: int | None = None) -> Callable[[str], int]:
         if value is None or value < low or (high is not None and value > high):
             end = 'on' if high is None else f'to {high}'
             raise argparse.ArgumentTypeError(f'{text!r} is no whole number from {low} {end}')
+        return value
+
+    return parse
+
+
+def number(low: float, high: float, unit: str = '') -> Callable[[str], float]:
+    """A number from `low` to `high`."""
+    def parse(text: str) -> float:
+        value = _number(text)
+        if not low <= value <= high:
+            end = f'{high:g} {unit}'.strip()
+            raise argparse.ArgumentTypeError(f'{text!r} is no number from {low:g} to {end}')
+        return value
+
+    return parse
+
+
+def image_width(low: int) -> Callable[[str], int]:
+    """The width of simulated images in pixels, from `low` on; they are 4:3."""
+    def parse(text: str) -> int:
+        value = whole(low, WIDEST)(text)
+        if value % 4:
+            raise argparse.ArgumentTypeError(f'{text!r} is no multiple of 4 px')
         return value
 
     return parse

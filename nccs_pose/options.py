@@ -74,7 +74,8 @@ def check_value(field: dataclasses.Field[Any], value: Any) -> None:
             f'{field.name} = {value!r}: expected {expected.__name__}, got {type(value).__name__}')
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low, high = field.metadata['low'], field.metadata['high']
-        if not math.isfinite(value):
+        # An int is finite, however long; a float may not hold it.
+        if isinstance(value, float) and not math.isfinite(value):
             raise OptionError(f'{field.name} = {value!r}: must be finite')
         if (low is not None and value < low) or (high is not None and value > high):
             unit = f' {field.metadata["unit"]}' if field.metadata['unit'] else ''

@@ -190,6 +190,16 @@ def test_a_bag_is_never_overwritten_and_stamps_must_be_ros_time(tmp_path: Path) 
         writer.write_image(T0, PICTURE, compression='gif')
 
 
+def test_a_path_that_cannot_be_is_named(tmp_path: Path) -> None:
+    path = tmp_path / ('x' * 300)
+    with pytest.raises(FileError, match=r'x: cannot be made: File name too long'):
+        BagWriter(path).__enter__()
+    assert ': cannot be read: File name too long' in refusal(path)
+    bag = small_bag(tmp_path / 'bag')
+    (bag / 'bag.mcap').unlink()
+    assert 'bag.mcap' in refusal(bag)
+
+
 @pytest.mark.parametrize('part', [0.0, 0.001, 0.3, 0.7, 0.99, 0.9999])
 def test_a_truncated_bag_is_refused(tmp_path: Path, part: float) -> None:
     path = small_bag(tmp_path / 'bag')

@@ -163,6 +163,26 @@ def test_a_camera_pushed_sideways_sees_what_a_turned_mirror_frame_says():
         moved.T_base_mirror.rotate(axis), rig.T_base_mirror.rotate(axis), atol=1e-15)
 
 
+def test_a_mirror_that_shrinks_below_its_rim_takes_the_rim_along():
+    true = RIGS['arena']
+    half = replace(true, mirror=replace(true.mirror, rim_radius=0.03))
+    parameters = RigParameters(true, LINES, EVERYTHING)
+    theta = np.zeros(len(parameters))
+    theta[parameters.index['mirror_C']] = -1e-6
+    smaller = parameters.model(theta, with_rim=True).rig.mirror
+    assert smaller.rim_radius == np.sqrt(true.mirror.C - 1e-6) < true.mirror.rim_radius
+    assert RigParameters(half, LINES, EVERYTHING).model(
+        theta, with_rim=True).rig.mirror.rim_radius == 0.03
+    # A drive under a mirror 2 % smaller than its rough rig says.
+    rng = np.random.default_rng(3)
+    small = replace(true, mirror=QuadricMirror(1.0, 0.0, 0.96 * true.mirror.C))
+    frames, _ = measured_frames(small, LINES, 25, rng, points=40)
+    found = calibrate(true, LINES, frames, CalibrationOptions(mirror=True))
+    mirror = found.model.rig.mirror
+    assert mirror.rim_radius == np.sqrt(mirror.C) < true.mirror.rim_radius
+    assert 'it was cut to that' in report_text(found)
+
+
 def test_schur_elimination_solves_the_same_system_as_a_dense_solver():
     rig = RIGS['hyperbolic']
     frames, poses = measured_frames(rig, LINES, 4, np.random.default_rng(0), points=20)

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 import json
 from pathlib import Path
+import re
 
 import cv2
 from nccs_pose.calibration.from_images import calibrate_images
@@ -137,6 +138,20 @@ def test_check_tells_a_true_rig_from_one_a_tenth_of_a_millimetre_off(drive, file
     assert 'residuals suggest the mirror moved by about 0.1' in capsys.readouterr().out
 
 
+def test_check_says_what_structure_is_worth_that_is_no_reason_to_calibrate(capsys):
+    config = REPOSITORY / 'config'
+    room = [str(REPOSITORY / 'bags/room'), '--rig', str(config / 'room_rig.yaml'),
+            '--map', str(config / 'room_map.yaml')]
+    assert main(['check', *room, '--pose-error', '6']) == 0
+    said = capsys.readouterr().out
+    structure = next(line for line in said.splitlines() if line.startswith('structure against'))
+    # The sequence's own calibration is 0.08 px beside its images.
+    assert re.search(
+        r'\): worth \d\.\d mm in the poses, less than the 6 mm that matter', structure)
+    assert main(['check', *room, '--pose-error', '1']) == 1
+    assert 'worth' not in capsys.readouterr().out
+
+
 def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_path, capsys):
     rig, line_map, written = files
     red = LineMap(tuple(replace(line, colour='red') for line in line_map))
@@ -155,7 +170,9 @@ def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_pa
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'rough_cop=wide'],
              "'wide' is no float"),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'tilt=1'],
-             'NAME=VALUE with a known NAME'),
+             "there is no option 'tilt'; there are rough_cop, "),
+            (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'rough_cop=0.2'],
+             'rough_cop = 0.2 m: must lie in [1e-06, 0.1]'),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--free-line', 'attic'],
              "'attic' cannot be freed"),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--from-rim'],
@@ -165,6 +182,13 @@ def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_pa
             'calibrate', str(drive), *arguments, '--output', str(tmp_path / 'out.yaml')])
         assert words in words_said
         assert not (tmp_path / 'out.yaml').exists()
+
+
+def test_help_explains_every_option(capsys):
+    assert main(['calibrate', '--help']) == 0
+    text = capsys.readouterr().out
+    assert '  rough_cop=0.003 m  (1e-06 to 0.1)\n      Of the centre of projection.\n' in text
+    assert '  max_frames=40  (3 to 100000)\n      Most frames that enter the fit.\n' in text
 
 
 def test_a_place_without_images_is_named(drive, tmp_path, capsys):

@@ -19,16 +19,20 @@ from collections.abc import Callable
 import dataclasses
 import io
 import json
+import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
 import cv2
 from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
+from nccs_pose.cli.paper_localiser import PaperLocaliser
 from nccs_pose.cli.parser import COMMANDS
 from nccs_pose.cli.progress import Progress
-from nccs_pose.errors import FileError
+from nccs_pose.errors import FileError, FrameRefusedError, OptionError
+from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader, BagWriter
@@ -144,6 +148,25 @@ def test_the_paper_s_chain_runs_over_the_same_bag_and_is_worse(
     assert 3.0 * rmse['nccs'] < rmse['paper'] < 0.3
 
 
+def test_the_paper_s_chain_refuses_the_images_that_the_localiser_refuses(drive: Path) -> None:
+    rig, line_map = load_rig(f'{drive}_rig.yaml'), load_map(f'{drive}_map.yaml')
+    with BagReader(drive) as bag:
+        images = [(event.stamp_ns, event.decode()) for event in bag.events(odometry=False)]
+    for localiser in (kind(rig, line_map, LocaliserOptions()) for kind in (
+            Localiser, PaperLocaliser)):
+        for stamp, image in images:
+            assert localiser.process(stamp, image).pose is not None
+        last, image = images[-1]
+        for wrong, cause in (
+                ((last, image), 'duplicate_stamp'), ((last - 10**8, image), 'out_of_order'),
+                ((last + 10**8, image[:-1]), 'image_size')):
+            with pytest.raises(FrameRefusedError) as refused:
+                localiser.process(*wrong)
+            assert refused.value.cause == cause
+        # A bag that is played again begins anew.
+        assert localiser.process(images[0][0] - 10**10, images[0][1]).pose is not None
+
+
 def test_rendering_twice_gives_the_same_bag(drive: Path, tmp_path: Path) -> None:
     again = tmp_path / 'eight'
     main(['render', str(again), '--frames', '5', '--width', '640', '--scene', 'ideal'])
@@ -192,6 +215,26 @@ def test_a_bag_in_which_no_frame_is_answered_ends_with_1(tmp_path: Path, capsys:
     assert len(rows) == 3
     assert all(row['reason'] for row in rows)
     assert 'tracking' not in out
+
+
+def test_odometry_that_the_node_would_refuse_is_used_and_said(
+    tmp_path: Path, capsys: Capture,
+) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for stamp in (10**9, 2 * 10**9):
+            writer.write_image(stamp, np.zeros((720, 960, 3), np.uint8), compression='png')
+            writer.write_odometry(stamp, Pose2(), frame_id='r1/odom', child_frame_id='r1/base')
+    call = ['replay', str(tmp_path / 'bag'), *ROOM, '--output', str(tmp_path / 'poses.tum')]
+    warning = said(capsys, call)[2]
+    assert warning.count('warning') == 1
+    assert "odometry of 'r1/base' in 'r1/odom' is used; the node takes that of 'base_link' in" in (
+        warning)
+    parameters = tmp_path / 'robot.yaml'
+    parameters.write_text(
+        'localiser: {ros__parameters: {frame_prefix: r1/, base_frame: base}}')
+    assert 'warning' not in said(capsys, [*call, '--params', str(parameters)])[2]
+    parameters.write_text('localiser: {ros__parameters: {odom_frame: 3}}')
+    assert 'robot.yaml: odom_frame = 3' in refusal(capsys, [*call, '--params', str(parameters)])
 
 
 def test_images_of_another_size_are_refused_one_by_one(tmp_path: Path, capsys: Capture) -> None:
@@ -264,6 +307,12 @@ talker:
     path.write_text(f'localiser: {{ros__parameters: {{{number.name}: {low - 1}}}}}')
     with pytest.raises(FileError, match=rf'params\.yaml: {number.name} = '):
         make_options(path, [])
+    for name in (number.name, 'window'):  # whole numbers that no float holds
+        path.write_text(f'localiser: {{ros__parameters: {{{name}: 1{"0" * 400}}}}}')
+        with pytest.raises(FileError, match=rf'params\.yaml: {name} = 10+.*: must lie in'):
+            make_options(path, [])
+    with pytest.raises(OptionError, match=r'--option window=10+: window = '):
+        make_options(None, [f'window=1{"0" * 400}'])
     path.write_text('talker: {ros__parameters: {}}')
     with pytest.raises(FileError, match=r'params\.yaml: localiser is missing'):
         make_options(path, [])
@@ -294,9 +343,16 @@ def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture
 def test_trajectories_without_common_time_end_with_1(tmp_path: Path, capsys: Capture) -> None:
     for name, start in (('a', 0), ('b', 10**12)):
         write_tum(Trajectory(start + np.arange(3), np.zeros((3, 3))), tmp_path / f'{name}.tum')
-    code, out, _ = said(capsys, ['evaluate', str(tmp_path / 'a.tum'), str(tmp_path / 'b.tum')])
+    code, out, err = said(
+        capsys, ['evaluate', str(tmp_path / 'a.tum'), str(tmp_path / 'b.tum')])
     assert code == 1
     assert '0 compared' in out
+    assert 'nothing to compare: no pose has a true one within 0.001 s' in err
+    assert 'b.tum from 1000.000000000 to 1000.000000002 s' in err
+    (tmp_path / 'b.tum').write_text('')
+    code, _, err = said(capsys, ['evaluate', str(tmp_path / 'a.tum'), str(tmp_path / 'b.tum')])
+    assert code == 1
+    assert 'b.tum holds no pose' in err
 
 
 def test_help_is_complete_and_explains_every_command(capsys: Capture) -> None:
@@ -315,6 +371,21 @@ def test_help_is_complete_and_explains_every_command(capsys: Capture) -> None:
     (['replay', 'bag', '--overlays', '-1'], "'-1' is no whole number from 0 on"),
     (['render', 'bag', '--quality', '101'], "'101' is no whole number from 0 to 100"),
     (['render', 'bag', '--seed', '-1'], "'-1' is no whole number"),
+    (['render', 'bag', '--rate', '1e-9'], "'1e-9' is no number from 0.01 to 1000 Hz"),
+    (['render', 'bag', '--rate', 'inf'], "'inf' is no number from 0.01"),
+    (['render', 'bag', '--rate', 'nan'], "'nan' is no number from 0.01"),
+    (['render', 'bag', '--speed', '1e300'], "'1e300' is no number from 0.001 to 100 m/s"),
+    (['render', 'bag', '--width', '1000000'], "'1000000' is no whole number from 64 to 8192"),
+    (['render', 'bag', '--width', '66'], "'66' is no multiple of 4 px"),
+    (['render', 'bag', '--frames', '0'], "'0' is no whole number from 1 to"),
+    (['stages', '--width', '-4'], "'-4' is no whole number from 160"),
+    (['stages', '--frames', '3'], "'3' is no whole number from 4"),
+    (['precision', '--noise', 'inf'], "'inf' is no number from 0.0001 to 1"),
+    (['precision', '--widths', '-4'], "'-4' is no whole number from 160"),
+    (['precision', '--poses', '1'], "'1' is no whole number from 2"),
+    (['coverage', '--trials', '1'], "'1' is no whole number from 2"),
+    (['benchmark', '--repetitions', '2'], "'2' is no whole number from 3"),
+    (['check', 'bag', '--pose-error', 'nan'], "'nan' is no number from 0.01 to 1000 mm"),
     (['check', 'bag', '--images', '0'], "'0' is no whole number from 1 on"),
     (['evaluate', 'a', 'b', '--max-gap', 'nan'], "'nan' is no time"),
     (['evaluate', 'a', 'b', '--tolerance', '-1'], "'-1' is no time")])
@@ -340,6 +411,83 @@ def test_help_loads_neither_numpy_nor_opencv() -> None:
     run = subprocess.run(
         [sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == '[]'
+
+
+def test_what_is_there_is_not_overwritten_by_a_drive(tmp_path: Path, capsys: Capture) -> None:
+    words = ['render', str(tmp_path / 'mine'), '--frames', '1', '--width', '64']
+    for kind in ('rig', 'map'):
+        own = tmp_path / f'mine_{kind}.yaml'
+        own.write_text('my own')
+        assert f'mine_{kind}.yaml: exists already' in refusal(capsys, words)
+        assert own.read_text() == 'my own'
+        assert not (tmp_path / 'mine').exists()
+        own.unlink()
+
+
+@pytest.mark.parametrize('arguments', [
+    ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p.tum', '--plots', 'BAD'],
+    ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'BAD/n.md'],
+    ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--plots', 'BAD'],
+    ['faults', '--output', 'BAD'], ['precision', '--output', 'BAD'],
+    ['coverage', '--output', 'BAD/c.md'], ['stages', '--output', 'BAD/s.json'],
+    ['starts', '--output', 'BAD/s.md'], ['experiment', 'no-guess', '--output', 'BAD'],
+    ['calibrate', str(REPO / 'bags/room'), *ROOM, '--output', f'OUT/{"x" * 235}.yaml']])
+def test_what_cannot_be_written_is_said_before_the_work(
+    arguments: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    write_tum(Trajectory([0], np.zeros((1, 3))), tmp_path / 'a.tum')
+    monkeypatch.setattr('nccs_pose.cli.progress.Progress.step', None)  # no work is done
+    call = [a.replace('BAD', '/dev/null').replace('OUT', str(tmp_path)) for a in arguments]
+    code, out, err = said(capsys, call)
+    assert code == 2
+    assert 'cannot be written' in err
+    assert not out
+
+
+def test_a_path_that_cannot_be_is_named(
+    drive: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    files, long = calibrated(drive), str(tmp_path / ('x' * 300))
+    for arguments in (
+            ['replay', long, *files, '--output', str(tmp_path / 'p.tum')],
+            ['replay', str(drive), *files, '--output', f'{long}/p.tum'],
+            ['replay', str(drive), '--rig', long, '--map', files[3], '--output', 'p.tum'],
+            ['check', long, *files], ['render', long, '--frames', '1'], ['evaluate', long, long]):
+        message = refusal(capsys, arguments)
+        assert 'xxx' in message and 'File name too long' in message
+
+    def fails(error: Exception) -> Callable[..., int]:
+        def run(*_: object) -> int:
+            raise error
+        return run
+
+    for error, words in (
+            (PermissionError(13, 'Permission denied', 'a/b'), 'a/b: Permission denied.'),
+            (OSError('odd'), 'evaluate: odd.'), (MemoryError(), 'too little memory')):
+        monkeypatch.setattr('nccs_pose.cli.evaluate.run', fails(error))
+        assert words in refusal(capsys, ['evaluate', 'a', 'b'])
+
+
+def test_no_character_ends_finished_work(drive: Path, tmp_path: Path) -> None:
+    plain = {**os.environ, 'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+    odd = os.fsencode(tmp_path) + b'/re\xfe\xc3\xa4$_$'
+    call = [sys.executable, '-m', 'nccs_pose.cli']
+    for environment in (plain, {**os.environ, 'PYTHONUTF8': '1'}):
+        run = subprocess.run(
+            [*call, 'render', odd, '--frames', '1', '--width', '160'], cwd=REPO,
+            env=environment, capture_output=True)
+        assert run.returncode == 0, run.stderr
+        assert b'1 frames; replay it with' in run.stdout
+        load_rig(Path(os.fsdecode(odd) + '_rig.yaml'))
+        run = subprocess.run(
+            [*call, 'replay', odd, '--rig', odd + b'_rig.yaml', '--map', odd + b'_map.yaml',
+             '--output', odd + b'.tum', '--plots', odd + b'_plots'], cwd=REPO, env=environment,
+            capture_output=True)
+        assert b'Traceback' not in run.stderr
+        assert Path(os.fsdecode(odd) + '_plots', 'trajectory.png').exists()
+        for made in tmp_path.iterdir():
+            shutil.rmtree(made, ignore_errors=True)
+            made.unlink(missing_ok=True)
 
 
 def test_a_missing_package_is_named() -> None:

@@ -286,9 +286,9 @@ def test_the_command_names_faults_and_refuses_what_it_does_not_know(capsys):
     assert listed == list(BY_NAME)
     for arguments, words in (
         (['thunder'], "no fault is called 'thunder'"),
-        (['none', '--width', '641'], '--width 641'),
-        (['none', '--frames', '9'], '--frames 9'),
-        (['none', '--drives', '0'], '--drives 0'),
+        (['none', '--width', '641'], "--width: '641'"),
+        (['none', '--frames', '9'], "--frames: '9'"),
+        (['none', '--drives', '0'], "--drives: '0'"),
     ):
         assert main(['faults', *arguments]) == 2
         assert words in capsys.readouterr().err

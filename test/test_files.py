@@ -15,16 +15,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import os
 from pathlib import Path
 import subprocess
 import sys
+import time
 
 from calibration_reader import read_calibration
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.saved_pose import read_saved_pose
+from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.trajectories import read_tum, write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
+from nccs_pose.files.yaml_sections import read_yaml
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 import pytest
@@ -99,9 +104,9 @@ lines:
   - {name: "it's: no", start: [0.1, 0, 0.5], end: [.5, 2, 0.5], width: 5e-2, colour: green}
   - {start: [0, 0, 0], end: [0, 0, 2], width: 0, name: "null"}
 """
-    line_map = load_map(map_file(tmp_path, text))
+    line_map = load_map(map_file(tmp_path, text), tapes=False)
     save_map(line_map, tmp_path / 'again.yaml', comment='saved')
-    again = load_map(tmp_path / 'again.yaml')
+    again = load_map(tmp_path / 'again.yaml', tapes=False)
     assert line_map.frame == again.frame == 'arena'
     assert [line.name for line in again] == ['line0', "it's: no", 'null']
     assert [line.colour for line in again] == ['red', 'green', 'red']
@@ -121,7 +126,7 @@ lines:
     ('A: 1.0', 'A: 1.0\n  A: 1.0', ['line', "'A'", 'twice']),
     ('C: 0.001024', 'C: -0.001024', ['mirror', '-0.001024']),
     ('width: 960', 'width: 960.5', ['camera.width', 'whole number', '960.5']),
-    ('height: 720', 'height: 0', ['camera.height', 'above 0', '0']),
+    ('height: 720', 'height: 0', ['camera.height', '1 to 16384', '0']),
     ('K: [588.75, ', 'K: [', ['camera.K', '9 numbers', '8']),
     ('K: [588.75, 0.0', 'K: [588.75, 7.5', ['camera.K', '7.5']),
     ('K: [588.75', 'K: [-588.75', ['camera.K', 'above 0', '-588.75']),
@@ -136,6 +141,12 @@ lines:
     ('mounting:', 'mountings:', ['mounting', 'missing', 'is mountings meant?']),
     ('rpy: [3.1485739705977704, ', 'rpy: [', ['mounting.rpy', '3 numbers', '2']),
     ('mirror:', 'mirror: [1', ['line']),
+    ('A: 1.0', 'A: 1e150', ['mirror.A', 'at most 1e+07', '1e+150']),
+    ('B: 0.0', 'B: 1e300', ['mirror.B', 'at most 1e+07', '1e+300']),
+    ('rim_radius: 0.032', 'rim_radius: 1e300', ['mirror.rim_radius', 'at most 1e+07']),
+    ('0.75]', '1e300]', ['mounting.translation[2]', 'at most 1e+07']),
+    ('0.75]', '-0.75]', ['mounting.translation[2]', 'above 0', 'floor', '-0.75']),
+    ('width: 960', 'width: 1000000', ['camera.width', '1 to 16384', '1000000']),
 ])
 def test_a_wrong_rig_is_refused_by_key_and_value(
     tmp_path: Path, old: str, new: str, words: list[str],
@@ -158,6 +169,13 @@ def test_a_wrong_rig_is_refused_by_key_and_value(
      ['again', 'south', 'once more']),
     (MAP.replace('name: east', 'name: 7'), ['lines[1].name', '7', 'quotes']),
     (MAP.replace('width: 0.05', 'width: -0.05'), ['width', 'at least 0', '-0.05']),
+    (MAP.replace('width: 0.05', 'width: 1e300'), ['width', 'at most 1e+07', '1e+300']),
+    (MAP.replace('width: 0.05', 'width: 0'), ['lines[0]', 'south', 'no tape', 'above 0 m']),
+    (MAP.replace('-1.55]', '-1.55, 1]').replace('end: [1.25, -1.65]', 'end: [1.25, -1.65, 1]'),
+     ['lines[0]', 'south', 'no tape', 'not 1 and 1']),
+    (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, -1.65], colour: octarine'),
+     ['lines[0].colour', 'octarine', 'green, red']),
+    (MAP.replace('colour: green', 'colour: octarine'), ['colour', 'octarine', 'green, red']),
     (MAP.replace('width: 0.05', 'width: 5 cm'), ['width', 'number in m', '5 cm']),
     (MAP.replace('colour', 'color'), ['color', 'unknown', 'colour']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, -1.65, 0.3]'), ['lines[0]', 'horizontal']),
@@ -177,6 +195,22 @@ def test_a_wrong_map_is_refused_by_key_and_value(
         assert word in message
 
 
+def test_a_thousand_lines_are_compared_at_once(tmp_path: Path) -> None:
+    ends = np.random.default_rng(0).uniform(-30.0, 30.0, (1000, 4)).round(3).tolist()
+    rows = [f'  - {{start: {e[:2]}, end: {e[2:]}}}\n' for e in ends]
+    path = map_file(tmp_path, f'width: 0.05\nlines:\n{"".join(rows)}')
+    begin = time.perf_counter()
+    read_yaml(path)
+    middle = time.perf_counter()
+    assert len(load_map(path)) == 1000
+    # A second is for a busy machine; of pairs compared one by one it were half a minute.
+    assert time.perf_counter() - middle < 1.0 + 3.0 * (middle - begin)
+    again = ', '.join(str(v + 9e-4) for v in ends[500][2:]), ', '.join(map(str, ends[500][:2]))
+    rows.append(f'  - {{name: again, start: [{again[0]}], end: [{again[1]}]}}\n')
+    message = refusal(load_map, map_file(tmp_path, f'width: 0.05\nlines:\n{"".join(rows)}'))
+    assert "lines[1000] (line 'again') is line 'line500' once more" in message
+
+
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / 'binary.yaml').write_bytes(b'\x89PNG\xff\xfe\x00')
     assert 'UTF-8' in refusal(load_rig, tmp_path / 'binary.yaml')
@@ -193,6 +227,46 @@ def test_text_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert not Path('/dev/null').is_file()
     with pytest.raises(FileError, match=r'b\.txt.*cannot be written'):
         write_text(tmp_path / 'new' / 'a.txt' / 'b.txt', 'x')
+
+
+@pytest.mark.parametrize('read', [load_rig, load_map, read_tum, read_saved_pose])
+def test_only_regular_files_of_some_size_are_read(
+    read: Callable[[Path], object], tmp_path: Path,
+) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'endless').symlink_to('/dev/zero')
+    for name in ('pipe', 'endless'):
+        assert 'cannot be read: it is a pipe or a device' in refusal(
+            read, tmp_path / name)
+    with (tmp_path / 'large').open('wb') as file:
+        file.truncate(2**28 + 1)
+    assert 'cannot be read: it has more than' in refusal(read, tmp_path / 'large')
+    assert 'File name too long' in refusal(read, tmp_path / ('x' * 300))
+
+
+def test_what_cannot_be_written_is_said_before_and_after(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+
+    def write(path: Path) -> None:
+        write_text(path, 'text')
+
+    for path, words in (
+            (tmp_path / ('x' * 250), 'File name too long'),
+            (tmp_path / ('x' * 300) / 'a', 'File name too long'),
+            (Path('/proc/nowhere/a'), 'cannot be written: No such file')):
+        assert words in refusal(check_writable, path)
+        assert words in refusal(write, path)
+    assert 'folder' in refusal(check_writable, tmp_path)
+    # Nobody reads it: to wait for a reader would be to hang.
+    assert 'cannot be written' in refusal(write, tmp_path / 'pipe')
+    check_writable('/dev/null')
+    check_writable(tmp_path / 'fine')
+    assert [path.name for path in tmp_path.iterdir()] == ['pipe']
+
+
+def test_a_name_in_another_encoding_is_written_as_an_escape(tmp_path: Path) -> None:
+    write_text(tmp_path / 'a', '# of re\udcfe\n')
+    assert (tmp_path / 'a').read_text(encoding='utf-8') == '# of re\\udcfe\n'
 
 
 def example_trajectory() -> Trajectory:

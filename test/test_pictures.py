@@ -49,6 +49,11 @@ def test_a_folder_of_images_gives_pixels_as_they_lie_and_no_half_image(tmp_path:
     read = dict(read_images(image_files(tmp_path)))
     assert [i.shape for i in read.values()] == 2 * [(24, 32, 3)]
     np.testing.assert_array_equal(read[100_000_000], image)
+    # A bag stays one with pictures in it.
+    (tmp_path / 'metadata.yaml').write_text('')
+    assert image_files(tmp_path) == image_files(tmp_path / '0.jpg') == []
+    with pytest.raises(FileError, match='File name too long'):
+        image_files(tmp_path / ('x' * 300))
     bad = {'half.jpg': jpeg[:len(jpeg) // 2], 'none.png': b'', 'x.bmp': b'x'}
     for name, content in bad.items():
         (tmp_path / name).write_bytes(content)

@@ -101,14 +101,18 @@ class RigParameters:
     def model(self, theta: Array, *, with_rim: bool = False) -> RigModel:
         """The rig and map at theta (P,).
 
-        :param with_rim: put the mirror's rim back, for use outside the adjustment.
+        :param with_rim: put the mirror's rim back, for use outside the adjustment; no wider than
+            the mirror has become.
         :raises GeometryError: if there can be no such rig.
         """
         rough = self._bare
         d_mirror = self._part(theta, 'mirror_A', 'mirror_B', 'mirror_C')
         mirror = QuadricMirror(
             rough.mirror.A + d_mirror[0], rough.mirror.B + d_mirror[1],
-            rough.mirror.C + d_mirror[2], self.rough.rig.mirror.rim_radius if with_rim else None)
+            rough.mirror.C + d_mirror[2])
+        rim = self.rough.rig.mirror.rim_radius
+        if with_rim and rim is not None:
+            mirror = replace(mirror, rim_radius=min(rim, mirror.largest_radius))
         camera = rough.camera
         shift, zoom = self._part(theta, 'cx', 'cy'), 1.0 + self._part(theta, 'focal')[0]
         if {'cx', 'focal'} & self.index.keys():

@@ -20,6 +20,7 @@ input or the usage is wrong; 130 interrupted.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import io
 import os
 import sys
 
@@ -38,6 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     command = find_command(argv)
     name = f'nccs-pose {command.name}' if command else 'nccs-pose'
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A character that the terminal, or UTF-8, does not know must not end finished work.
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         code = parse(argv).run()
         # What is still buffered meets a closed pipe here, not while Python ends.
@@ -54,6 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # e.g. `nccs-pose ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        what = f'{error.filename}: ' if error.filename else ''
+        print(f'{name}: {what}{error.strerror or error}.', file=sys.stderr)
+        return 2
+    except MemoryError:
+        print(f'{name}: this machine has too little memory for it.', file=sys.stderr)
+        return 2
     except ModuleNotFoundError as error:
         if (error.name or '').startswith('nccs_pose'):
             raise

@@ -21,6 +21,7 @@ import argparse
 import json
 from pathlib import Path
 
+from nccs_pose.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation import stages
 from nccs_pose.evaluation.benchmark import as_numbers, CELLS, report, run_benchmark
@@ -31,7 +32,8 @@ _WIDTH = 1280  # px, of the images whose stages are timed
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command line."""
-    parser.add_argument('--repetitions', type=int, default=50, help='scenes timed (default 50)')
+    parser.add_argument(
+        '--repetitions', type=whole(3, 10**6), default=50, help='scenes timed (default 50)')
     parser.add_argument('--output', type=Path, help='JSON file for every single timing')
 
 
@@ -39,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the tables, and write the numbers behind them."""
     if arguments.output is not None:
         check_writable(arguments.output)
-    with Progress(len(CELLS) * max(0, arguments.repetitions), 'scenes') as progress:
+    with Progress(len(CELLS) * arguments.repetitions, 'scenes') as progress:
         benchmark = run_benchmark(arguments.repetitions, progress.step)
     print(report(benchmark))
     frames = max(arguments.repetitions, stages.LEAST_FRAMES)

@@ -28,7 +28,7 @@ from nccs_pose.calibration.outline import find_outline
 from nccs_pose.calibration.procedure import Calibration
 from nccs_pose.calibration.rim import rig_from_outline
 from nccs_pose.cli.drive_images import DriveImages
-from nccs_pose.errors import OptionError
+from nccs_pose.cli.option_settings import explain, parse_settings
 from nccs_pose.files.pictures import save_figure
 from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
@@ -37,6 +37,9 @@ from nccs_pose.geometry.rig import Rig
 _FREE = {
     'mirror': 'mirror', 'principal-point': 'principal_point', 'focal-length': 'focal_length',
     'tape-width': 'tape_width'}
+_NUMBERS = {
+    field.name: field for field in dataclasses.fields(CalibrationOptions)
+    if not isinstance(field.default, bool)}
 _OUTLINE_IMAGES = 10
 
 
@@ -62,18 +65,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="first guess of the camera's place from the mirror's outline (needs rim_radius)")
     parser.add_argument(
         '--option', action='append', default=[], metavar='NAME=VALUE',
-        help='set an option of the calibration: ' + ', '.join(
-            f.name for f in dataclasses.fields(CalibrationOptions)
-            if not isinstance(f.default, bool)) + '; may be given again')
+        help='set an option of the calibration, see below; may be given again')
     parser.add_argument('--images', type=whole(1), default=150, metavar='N',
                         help='look at this many images at most (default %(default)s)')
     parser.add_argument('--image-topic', metavar='TOPIC', help='if the bag has several')
+    parser.epilog = (
+        'options of the calibration (rough_*: standard deviation of what the rough rig says):\n'
+        f'{explain(_NUMBERS)}\n\n{parser.epilog}')
 
 
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = _options(args)
-    check_writable(args.output)
+    for ending in (args.output.suffix, '.map.yaml', '.report.md', '.residuals_image.png'):
+        check_writable(args.output.with_suffix(ending))
     images = DriveImages(args.bag, args.images, args.image_topic)
     images.check_size(rig.camera)
     if args.from_rim:
@@ -91,19 +96,9 @@ def _options(args: argparse.Namespace) -> CalibrationOptions:
 
     :raises OptionError: naming what is not one.
     """
-    values: dict[str, bool | int | float] = {_FREE[name]: True for name in args.free}
-    values |= dict.fromkeys(args.hold, False)
-    for setting in args.option:
-        name, found, text = setting.partition('=')
-        default = getattr(CalibrationOptions, name, None)
-        if not found or isinstance(default, bool) or not isinstance(default, (int, float)):
-            raise OptionError(f'--option {setting}: expected NAME=VALUE with a known NAME')
-        kind = type(default)
-        try:
-            values[name] = kind(text)
-        except ValueError:
-            raise OptionError(f'--option {setting}: {text!r} is no {kind.__name__}') from None
-    return dataclasses.replace(CalibrationOptions(), **values)  # type: ignore[arg-type]
+    return CalibrationOptions(
+        **{_FREE[name]: True for name in args.free}, **dict.fromkeys(args.hold, False),
+        **parse_settings(args.option, _NUMBERS))
 
 
 def _from_rim(rig: Rig, images: DriveImages, options: CalibrationOptions) -> Rig:

@@ -19,10 +19,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from nccs_pose.argument_types import whole
+from nccs_pose.argument_types import number, whole
 from nccs_pose.calibration.from_images import measure
 from nccs_pose.calibration.judgement import judge, Judgement, robust_deviation
-from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions
+from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, MonitorOptions, Verdict
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rig', type=Path, required=True, help='the rig to check (YAML)')
     parser.add_argument('--map', type=Path, required=True, help='map of the lines (YAML)')
     parser.add_argument(
-        '--pose-error', type=float, default=5.0, metavar='MM',
+        '--pose-error', type=number(0.01, 1000.0, 'mm'), default=5.0, metavar='MM',
         help='pose error that matters, mm (default %(default)s)')
     parser.add_argument('--images', type=whole(1), default=150, metavar='N',
                         help='look at this many images at most (default %(default)s)')
@@ -67,9 +67,17 @@ def run(args: argparse.Namespace) -> int:
         model = RigModel(rig, line_map)
         _print_structure(judge(model, model, measured.frames, measured.poses), line_map)
     print(f'structure against noise: {verdict.statistic:.0f} (noise alone stays below '
-          f'{verdict.limit:.0f})')
+          f'{verdict.limit:.0f}){_worth(verdict, options)}')
     print(verdict.words)
     return 0 if verdict.condition is Condition.GOOD else 1
+
+
+def _worth(verdict: Verdict, options: MonitorOptions) -> str:
+    """What structure that is no noise means for a calibration that is good all the same."""
+    if verdict.condition is not Condition.GOOD or verdict.statistic <= verdict.limit:
+        return ''
+    return (f': worth {1e3 * verdict.pose_error:.1f} mm in the poses, less than the '
+            f'{1e3 * options.pose_error:g} mm that matter (--pose-error)')
 
 
 def _print_structure(judged: Judgement, line_map: LineMap) -> None:

@@ -24,7 +24,7 @@ from nccs_pose.argument_types import whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.coverage import coverage_table, run_scenario, Scenario, SCENARIOS
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import check_writable, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='only those whose names contain one of these words; all if none is given')
     parser.add_argument('--list', action='store_true', help='name the scenarios and stop')
     parser.add_argument(
-        '--trials', type=int, default=60, metavar='N',
+        '--trials', type=whole(2, 10**6), default=60, metavar='N',
         help='images of each scenario (default: %(default)s)')
     parser.add_argument(
         '--seed', type=whole(0), default=3, help='of poses and noise (default: %(default)s)')
@@ -47,8 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print('\n'.join(scenario.name for scenario in scenarios))
         return 0
-    if arguments.trials < 2:
-        raise OptionError(f'--trials {arguments.trials}: statistics need at least 2')
+    if arguments.output is not None:
+        check_writable(arguments.output)
     rows = []
     with Progress(len(scenarios) * arguments.trials, 'trials') as progress:
         for scenario in scenarios:

@@ -37,7 +37,7 @@ class DriveImages:
 
     def __init__(self, path: Path, most: int, topic: str | None = None) -> None:
         self._path, self._topics = path, BagTopics(topic)
-        self._files = image_files(path) if path.is_dir() else []
+        self._files = image_files(path)
         if not path.exists():
             raise FileError(f'{path}: no such bag or folder of images.')
         if self._files:

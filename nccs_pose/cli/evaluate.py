@@ -18,14 +18,16 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+import sys
 
-from nccs_pose.argument_types import seconds
+from nccs_pose.argument_types import seconds, whole
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.tables import as_numbers, summary_table
-from nccs_pose.files.pictures import save_figure
-from nccs_pose.files.text_files import write_text
-from nccs_pose.files.trajectories import read_tum
+from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.pictures import as_title, save_figure
+from nccs_pose.files.text_files import check_writable, write_text
+from nccs_pose.files.trajectories import format_stamp, read_tum
 from nccs_pose.files.yaml_files import load_map
 
 
@@ -33,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('estimated', type=Path, metavar='ESTIMATED.tum')
     parser.add_argument('truth', type=Path, metavar='TRUTH.tum')
     parser.add_argument(
-        '--frames', type=int, metavar='N',
+        '--frames', type=whole(0), metavar='N',
         help='images that the trajectory was made from, to count those not answered '
              '(default: as many as there are poses)')
     parser.add_argument(
@@ -54,6 +56,11 @@ def run(args: argparse.Namespace) -> int:
     estimated, truth = read_tum(args.estimated), read_tum(args.truth)
     if args.output and args.output.suffix not in ('.json', '.md'):
         raise FileError(f'{args.output}: the numbers are written as .json or .md.')
+    lines = tuple(load_map(args.map)) if args.map else ()
+    if args.output:
+        check_writable(args.output)
+    if args.plots:
+        check_writable(args.plots / 'trajectory.png')
     if args.frames is not None and args.frames < len(estimated):
         raise FileError(
             f'--frames {args.frames}: {args.estimated} has more poses, {len(estimated)}.')
@@ -72,11 +79,28 @@ def run(args: argparse.Namespace) -> int:
             trajectory_figure,
         )
 
-        lines = tuple(load_map(args.map)) if args.map else ()
+        name = as_title(args.estimated.name)
         figures = {
-            'trajectory': trajectory_figure(estimated, truth, lines, args.estimated.name),
-            'errors': error_figure(errors, title=args.estimated.name),
-            'histogram': histogram_figure(errors, args.estimated.name)}
-        for name, figure in figures.items():
-            save_figure(figure, args.plots / f'{name}.png')
-    return 0 if len(errors) else 1
+            'trajectory': trajectory_figure(estimated, truth, lines, name),
+            'errors': error_figure(errors, title=name),
+            'histogram': histogram_figure(errors, name)}
+        for kind, figure in figures.items():
+            save_figure(figure, args.plots / f'{kind}.png')
+    if not len(errors):
+        print(
+            f'nccs-pose evaluate: {_why_nothing(estimated, truth, args)}', file=sys.stderr)
+        return 1
+    return 0
+
+
+def _why_nothing(estimated: Trajectory, truth: Trajectory, args: argparse.Namespace) -> str:
+    """Why no pose could be compared."""
+    for path, trajectory in ((args.estimated, estimated), (args.truth, truth)):
+        if not len(trajectory):
+            return f'nothing to compare: {path} holds no pose.'
+    spans = ' and '.join(
+        f'{path} from {format_stamp(min(t.stamps_ns))} to {format_stamp(max(t.stamps_ns))} s'
+        for path, t in ((args.estimated, estimated), (args.truth, truth)))
+    return (
+        f'nothing to compare: no pose has a true one within {args.tolerance:g} s, nor one on '
+        f'either side no more than {args.max_gap:g} s apart; {spans}.')

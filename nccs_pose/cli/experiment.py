@@ -22,6 +22,7 @@ import dataclasses
 import os
 from pathlib import Path
 
+from nccs_pose.argument_types import whole
 import nccs_pose.cli.one_thread  # noqa: F401 - before numpy
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
@@ -33,12 +34,13 @@ from nccs_pose.files.text_files import check_writable, write_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command line."""
     parser.add_argument('name', choices=NAMES, help='which experiment')
-    parser.add_argument('--trials', type=int, default=100, help='trials per cell (paper: 1000)')
+    parser.add_argument(
+        '--trials', type=whole(1), default=100, help='trials per cell (paper: 1000)')
     parser.add_argument(
         '--output', type=Path, required=True,
         help='folder for the CSV of every trial, the figure and the summary')
     parser.add_argument(
-        '--workers', type=int, default=os.cpu_count() or 1, help='processes (all cores)')
+        '--workers', type=whole(1), default=os.cpu_count() or 1, help='processes (all cores)')
     parser.add_argument(
         '--backend', default='loky', help="joblib's backend; one of a cluster's works too")
     for field in dataclasses.fields(ExperimentOptions):

@@ -19,13 +19,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from nccs_pose.argument_types import image_width, whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.evaluation.fault_table import combine, fault_csv, fault_table, run_fault
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.simulation.fault_list import FAULTS
 from nccs_pose.simulation.faults import Fault, rehearse
+
+_LEAST_FRAMES = 18  # 8 before the fault, 8 of it and 2 after it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,14 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('names', nargs='*', metavar='FAULT', help='which; all if none is named')
     parser.add_argument('--list', action='store_true', help='name the faults and stop')
     parser.add_argument(
-        '--width', type=int, default=640, metavar='PX',
+        '--width', type=image_width(160), default=640, metavar='PX',
         help='width of the images, 4:3 (default: %(default)s)')
     parser.add_argument(
-        '--frames', type=int, default=24, metavar='N',
+        '--frames', type=whole(_LEAST_FRAMES, 10**5), default=24, metavar='N',
         help='images of a clean drive, at 10 Hz; the fault begins at the ninth '
              '(default: %(default)s)')
     parser.add_argument(
-        '--drives', type=int, default=2, metavar='N',
+        '--drives', type=whole(1, 1000), default=2, metavar='N',
         help='on how many tracks each fault is played (default: %(default)s)')
     parser.add_argument(
         '--output', type=Path, metavar='DIR', help='write faults.md and faults.csv there')
@@ -53,15 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
         for fault in faults:
             print(f'{fault.name:20} {fault.description}')
         return 0
-    if arguments.width < 160 or arguments.width % 4:
-        raise OptionError(
-            f'--width {arguments.width}: must be a multiple of 4 px, from 160 px')
-    if arguments.drives < 1:
-        raise OptionError(f'--drives {arguments.drives}: must be 1 at least')
-    if arguments.frames < 18:
-        raise OptionError(
-            f'--frames {arguments.frames}: 8 before, 8 of the fault and 2 after it make 18 at '
-            'least')
+    if arguments.output is not None:
+        check_writable(arguments.output / 'faults.md')
     rehearsals = [
         rehearse(arguments.width, arguments.frames, seed) for seed in range(arguments.drives)]
     rows = []

@@ -20,58 +20,55 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from nccs_pose.cli.option_settings import parse_settings
 from nccs_pose.errors import FileError, OptionError
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.parameter_files import load_parameters
-from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.node_options import NodeOptions
+from nccs_pose.options import check_value
 
 _FIELDS = {field.name: field for field in dataclasses.fields(LocaliserOptions)}
+_FRAMES = ('odom_frame', 'base_frame', 'frame_prefix')
 
 
 def make_options(parameter_file: Path | None, settings: Iterable[str]) -> LocaliserOptions:
     """Options of the localiser: its defaults, then a parameter file, then `--option`s.
 
     :param settings: ``NAME=VALUE``.
-    :raises FileError: if an option is not known or its value is not accepted.
+    :raises FileError: if the file has a parameter that is not known or not accepted.
+    :raises OptionError: if a setting is not known or not accepted.
     """
-    values: dict[str, Any] = {}
-    if parameter_file is not None:
-        values |= _from_file(parameter_file)
-    for setting in settings:
-        name, _, text = setting.partition('=')
-        if name not in _FIELDS:
-            raise FileError(
-                f'--option {setting}: there is no option {name!r}; there are '
-                f'{", ".join(_FIELDS)}.')
-        values[name] = _parse(setting, text, _FIELDS[name].default)
+    values = _from_file(parameter_file) if parameter_file is not None else {}
+    return LocaliserOptions(**(values | parse_settings(settings, _FIELDS)))
+
+
+def odometry_frames(parameter_file: Path | None) -> tuple[str, str]:
+    """In which frame, and of which, the node takes odometry: its defaults, or as a file says.
+
+    :raises FileError: if the file names no frames.
+    """
+    given = load_parameters(parameter_file, 'localiser') if parameter_file is not None else {}
+    frames = {name: given[name] for name in _FRAMES if name in given}
     try:
-        return LocaliserOptions(**values)
+        node = NodeOptions(**frames)
     except OptionError as error:
-        source = f'{parameter_file}: ' if parameter_file is not None else ''
-        raise FileError(f'{source}{error}.') from error
+        raise FileError(f'{parameter_file}: {error}.') from error
+    return node.odom, node.base
 
 
 def _from_file(path: Path) -> dict[str, Any]:
     """The localiser's part of the node's parameters; what is the node's own is left to it."""
     own = {field.name for field in dataclasses.fields(NodeOptions)}
-    values = {}
+    values: dict[str, Any] = {}
     for name, value in load_parameters(path, 'localiser').items():
         if name in _FIELDS:
+            try:
+                check_value(_FIELDS[name], value)
+            except OptionError as error:
+                raise FileError(f'{path}: {error}.') from error
             # as ROS users write it: 1 where a float is meant
             is_float = isinstance(_FIELDS[name].default, float)
-            values[name] = float(value) if is_float and type(value) is int else value
+            values[name] = float(value) if is_float else value
         elif name not in own and not name.startswith(('use_sim_time', 'qos_overrides')):
             raise FileError(f'{path}: {name} is no parameter of the localiser.')
     return values
-
-
-def _parse(setting: str, text: str, default: Any) -> Any:
-    kind = type(default)
-    if kind is bool:
-        if text.lower() not in ('true', 'false'):
-            raise FileError(f'--option {setting}: must be true or false.')
-        return text.lower() == 'true'
-    try:
-        return kind(text)
-    except ValueError as error:
-        raise FileError(f'--option {setting}: must be a {kind.__name__}.') from error

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import time
 
+from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.estimate import Estimate, Quality, StageTimes, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.odometry import Odometry
@@ -49,6 +50,7 @@ class PaperLocaliser:
         self._rig, self._map = rig, line_map
         self._starter = Localiser(rig, line_map, options)
         self._odometry = Odometry(options.clock_jump)
+        self._admission = Admission(rig.camera, self._odometry, options.clock_jump)
         self._last: tuple[int, Pose2] | None = None
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
@@ -60,9 +62,13 @@ class PaperLocaliser:
     def process(self, stamp_ns: int, image: Image) -> Estimate:
         """Estimate the pose that an image was taken from.
 
-        :raises FrameRefusedError: as `Localiser` does, of the images before the first pose.
+        :raises FrameRefusedError: of the images that `Localiser` refuses.
         :raises EstimationError: if too few pixels of lines are found.
         """
+        if not self._admission.admit(stamp_ns, image):
+            self._odometry.clear()
+            self._starter.reset()
+            self._last = None
         if self._last is None:
             first = self._starter.process(stamp_ns, image)
             if first.pose is not None:

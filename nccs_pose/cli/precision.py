@@ -21,22 +21,22 @@ import argparse
 import json
 from pathlib import Path
 
-from nccs_pose.argument_types import whole
+from nccs_pose.argument_types import image_width, number, whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.evaluation.precision import as_numbers, precision_table, run_precision
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import check_writable, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command line."""
     parser.add_argument(
-        '--widths', type=int, nargs='+', default=[1280, 640], metavar='PX',
+        '--widths', type=image_width(160), nargs='+', default=[1280, 640], metavar='PX',
         help='widths of the images, 4:3 (default: 1280 640)')
     parser.add_argument(
-        '--poses', type=int, default=40, metavar='N',
+        '--poses', type=whole(2, 10**6), default=40, metavar='N',
         help='one image is taken at each of N random poses (default: %(default)s)')
     parser.add_argument(
-        '--noise', type=float, default=0.05, metavar='SHARE',
+        '--noise', type=number(1e-4, 1.0), default=0.05, metavar='SHARE',
         help='noise of every channel over full scale (default: %(default)s)')
     parser.add_argument(
         '--seed', type=whole(0), default=1, help='of poses and noise (default: %(default)s)')
@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print one table a size."""
+    if arguments.output is not None:
+        check_writable(arguments.output / 'precision.md')
     results = []
     with Progress(len(arguments.widths) * arguments.poses, 'images') as progress:
         for width in arguments.widths:

@@ -19,10 +19,11 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from nccs_pose.argument_types import whole
+from nccs_pose.argument_types import image_width, number, whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
 from nccs_pose.files.bags import BagWriter
+from nccs_pose.files.text_files import check_writable
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
 from nccs_pose.geometry.pose import RigidTransform
 from nccs_pose.geometry.rig import Rig
@@ -44,18 +45,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='arena: a room with floor texture, robot, light and an ordinary camera; ideal: '
              'tapes and grey-level noise alone (default %(default)s)')
     parser.add_argument(
-        '--width', type=int, default=1280, metavar='PX',
+        '--width', type=image_width(64), default=1280, metavar='PX',
         help='width of the images, 4:3 (default %(default)s)')
     parser.add_argument('--rig', type=Path, help="another rig than the scene's (YAML)")
     parser.add_argument('--map', type=Path, help="another map than the scene's (YAML)")
-    parser.add_argument('--frames', type=int, default=50, help='images (default %(default)s)')
     parser.add_argument(
-        '--rate', type=float, default=10.0, metavar='HZ', help='of images (default %(default)s)')
+        '--frames', type=whole(1, 10**6), default=50, help='images (default %(default)s)')
+    parser.add_argument(
+        '--rate', type=number(0.01, 1000.0, 'Hz'), default=10.0, metavar='HZ',
+        help='of images (default %(default)s)')
     parser.add_argument(
         '--track', choices=('eight', 'random'), default='eight',
         help='figure of eight, or a smooth random loop (default %(default)s)')
     parser.add_argument(
-        '--speed', type=float, default=0.35, metavar='M/S', help='(default %(default)s)')
+        '--speed', type=number(0.001, 100.0, 'm/s'), default=0.35, metavar='M/S',
+        help='(default %(default)s)')
     parser.add_argument(
         '--compression', choices=('none', 'jpeg', 'png'), default='jpeg',
         help='of the images in the bag (default %(default)s)')
@@ -66,16 +70,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.width < 64 or args.frames < 1 or not args.rate > 0.0:
-        raise FileError(
-            f'--width {args.width} --frames {args.frames} --rate {args.rate}: at least 64 px, '
-            '1 frame and a rate above 0 are needed.')
     scene = _scene(args)
     rng = np.random.default_rng(args.seed)
     track: Trajectory = (
         random_loop(rng, speed=args.speed) if args.track == 'random'
         else figure_of_eight(speed=args.speed))
     drive = make_drive(track, args.frames, args.rate, WheelModel(), rng, _START_NS)
+    rig_file, map_file = (_new_file(args.output, kind) for kind in ('rig', 'map'))
     with BagWriter(args.output) as bag, Progress(args.frames, 'frames') as progress:
         bag.write_tf_static(_START_NS, _mounting(scene.rig))
         for sample in stream(scene, drive, args.seed):
@@ -89,13 +90,23 @@ def run(args: argparse.Namespace) -> int:
             else:
                 bag.write_odometry(
                     sample.stamp_ns, sample.pose, twist=(sample.twist.forward, sample.twist.turn))
-    rig_file, map_file = (
-        args.output.with_name(f'{args.output.name}_{kind}.yaml') for kind in ('rig', 'map'))
     save_rig(scene.rig, rig_file, f'The rig that {args.output.name} was rendered with.')
     save_map(scene.line_map, map_file, f'The map that {args.output.name} was rendered with.')
     print(f'{args.output}: {args.frames} frames; replay it with')
     print(f'nccs-pose replay {args.output} --rig {rig_file} --map {map_file} --output poses.tum')
     return 0
+
+
+def _new_file(output: Path, kind: str) -> Path:
+    """Where the rig or the map goes, which may be somebody's own.
+
+    :raises FileError: if it is there already or cannot be written.
+    """
+    path = output.parent / f'{output.name}_{kind}.yaml'
+    check_writable(path)
+    if path.exists():
+        raise FileError(f'{path}: exists already; rigs and maps are never overwritten.')
+    return path
 
 
 def _scene(args: argparse.Namespace) -> Scene:

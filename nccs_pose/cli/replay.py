@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 import dataclasses
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ import sys
 from typing import Any
 
 from nccs_pose.argument_types import whole
-from nccs_pose.cli.localiser_options import make_options
+from nccs_pose.cli.localiser_options import make_options, odometry_frames
 from nccs_pose.cli.offline_run import (
     answered_poses,
     Answering,
@@ -48,9 +48,10 @@ from nccs_pose.evaluation.metrics import (
 )
 from nccs_pose.evaluation.tables import as_numbers, consistency_table, summary_table
 from nccs_pose.evaluation.trajectory import Trajectory
+from nccs_pose.files.bag_events import BagEvent, StampedOdometry
 from nccs_pose.files.bags import BagReader, BagTopics
-from nccs_pose.files.pictures import save_figure, save_image
-from nccs_pose.files.text_files import check_writable, write_text
+from nccs_pose.files.pictures import as_title, save_figure, save_image
+from nccs_pose.files.text_files import check_writable, read_text, write_text
 from nccs_pose.files.trajectories import write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.camera import PinholeCamera
@@ -62,6 +63,7 @@ import numpy as np
 
 _METHODS: dict[str, Callable[[Rig, LineMap, LocaliserOptions], Answering]] = {
     'nccs': Localiser, 'paper': PaperLocaliser}
+_ENDINGS = ('frames.jsonl', 'run.json', 'evaluation.json')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -97,7 +99,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = make_options(args.params, args.option)
-    check_writable(args.output)
+    frames = odometry_frames(args.params)
+    for path in (args.output, *(_beside(args.output, ending) for ending in _ENDINGS)):
+        check_writable(path)
+    if args.plots:
+        check_writable(args.plots / 'trajectory.png')
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:
@@ -110,9 +116,9 @@ def run(args: argparse.Namespace) -> int:
                 pictures.draw(record, image)
                 progress.step(record.estimate.state.value if record.estimate else 'refused')
 
+            events = _warning_of_frames(bag.events(odometry=not args.no_odometry), frames)
             records = run_events(
-                _METHODS[args.method](rig, line_map, options),
-                bag.events(odometry=not args.no_odometry), on_frame)
+                _METHODS[args.method](rig, line_map, options), events, on_frame)
         used = dataclasses.asdict(bag.topics)
         if bag.left_out:
             print(
@@ -149,6 +155,25 @@ def _check_camera(bag: BagReader, rig: Rig, path: Path) -> None:
             f'nccs-pose replay: warning: {bag.topics.camera_info} differs from the rig {path}, '
             f'which counts: fx fy cx cy are {_intrinsics(recorded)[:4]} in the bag and '
             f'{_intrinsics(camera)[:4]} in the rig.', file=sys.stderr)
+
+
+def _warning_of_frames(
+    events: Iterable[BagEvent], frames: tuple[str, str],
+) -> Iterator[BagEvent]:
+    """Hand on events; odometry that the node would refuse for its frames is used, but said."""
+    strange: set[tuple[str, str]] = set()
+    for event in events:
+        if isinstance(event, StampedOdometry):
+            own = (event.frame_id, event.child_frame_id)
+            # As the node does, take a name that the driver left empty.
+            refused = any(name not in ('', wanted) for name, wanted in zip(own, frames))
+            if refused and own not in strange:
+                strange.add(own)
+                print(
+                    f'nccs-pose replay: warning: odometry of {own[1]!r} in {own[0]!r} is used; '
+                    f'the node takes that of {frames[1]!r} in {frames[0]!r} alone (odom_frame, '
+                    'base_frame, frame_prefix).', file=sys.stderr)
+        yield event
 
 
 def _intrinsics(camera: PinholeCamera) -> list[float]:
@@ -207,7 +232,7 @@ def _draw_trajectory(
     from nccs_pose.evaluation.plots import trajectory_figure
 
     save_figure(
-        trajectory_figure(estimated, truth, line_map, str(args.bag)),
+        trajectory_figure(estimated, truth, line_map, as_title(args.bag)),
         args.plots / 'trajectory.png')
 
 
@@ -216,8 +241,8 @@ def _draw_errors(
 ) -> None:
     from nccs_pose.evaluation.plots import error_figure, histogram_figure
 
-    save_figure(error_figure(errors, covariances, str(args.bag)), args.plots / 'errors.png')
-    save_figure(histogram_figure(errors, str(args.bag)), args.plots / 'histogram.png')
+    save_figure(error_figure(errors, covariances, as_title(args.bag)), args.plots / 'errors.png')
+    save_figure(histogram_figure(errors, as_title(args.bag)), args.plots / 'histogram.png')
 
 
 def _print_states(records: list[FrameRecord]) -> None:
@@ -242,8 +267,8 @@ def _used(args: argparse.Namespace, options: LocaliserOptions, topics: dict[str,
     return json.dumps({
         'command': 'replay', 'method': args.method, 'bag': str(args.bag), 'topics': topics,
         'odometry': not args.no_odometry, 'options': dataclasses.asdict(options),
-        'rig': {'file': str(args.rig), 'text': args.rig.read_text(encoding='utf-8')},
-        'map': {'file': str(args.map), 'text': args.map.read_text(encoding='utf-8')},
+        'rig': {'file': str(args.rig), 'text': read_text(args.rig)},
+        'map': {'file': str(args.map), 'text': read_text(args.map)},
     }, indent=2) + '\n'
 
 

@@ -21,24 +21,27 @@ import argparse
 import json
 from pathlib import Path
 
+from nccs_pose.argument_types import image_width, whole
 from nccs_pose.cli.progress import Progress
-from nccs_pose.evaluation.stages import as_numbers, measure_stages, stages_table
-from nccs_pose.files.text_files import write_text
+from nccs_pose.evaluation.stages import as_numbers, LEAST_FRAMES, measure_stages, stages_table
+from nccs_pose.files.text_files import check_writable, write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command line."""
     parser.add_argument(
-        '--width', type=int, default=1280, metavar='PX',
+        '--width', type=image_width(160), default=1280, metavar='PX',
         help='width of the images, 4:3 (default: %(default)s)')
     parser.add_argument(
-        '--frames', type=int, default=40, metavar='N',
+        '--frames', type=whole(LEAST_FRAMES, 10**5), default=40, metavar='N',
         help='frames of the drive (default: %(default)s)')
     parser.add_argument('--output', type=Path, metavar='FILE', help='write every time as JSON')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the table."""
+    if arguments.output is not None:
+        check_writable(arguments.output)
     with Progress(3 * arguments.frames - 2, 'frames') as progress:
         costs = measure_stages(arguments.width, arguments.frames, progress=progress.step)
     print(stages_table(costs))

@@ -18,12 +18,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from nccs_pose.argument_types import whole
+from nccs_pose.argument_types import image_width, whole
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.yaml_files import load_map
 
 
@@ -38,10 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--option', action='append', default=[], metavar='NAME=VALUE',
         help='of the localiser, for --map (reach=9.0)')
     parser.add_argument(
-        '--widths', type=whole(160), nargs='+', default=[640, 1280], metavar='PX',
+        '--widths', type=image_width(160), nargs='+', default=[640, 1280], metavar='PX',
         help='of the images, 4:3 (default: 640 1280)')
     parser.add_argument(
-        '--trials', type=whole(1), default=24, metavar='N',
+        '--trials', type=whole(1, 10**6), default=24, metavar='N',
         help='images of each place and width (default: %(default)s)')
     parser.add_argument(
         '--seed', type=whole(0), default=7, help='of poses and noise (default: %(default)s)')
@@ -54,9 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print('\n'.join(place.name for place in places))
         return 0
-    for width in arguments.widths:
-        if width % 4:
-            raise OptionError(f'--widths {width}: must be a multiple of 4 px')
+    if arguments.output is not None:
+        check_writable(arguments.output)
     rows = []
     work = len(places) * len(arguments.widths) * arguments.trials
     with Progress(work, 'images') as progress:

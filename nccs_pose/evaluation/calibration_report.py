@@ -42,7 +42,7 @@ def report_text(calibration: Calibration, pictures: tuple[str, ...] = ()) -> str
     u = c.uncertainty
     lines = [
         '# Calibration', '', f'**Verdict:** {c.verdict}.', '', '## Parameters', '',
-        *_parameter_table(c), '',
+        *_parameter_table(c), '', *_cut_rim(c),
         'The standard deviations are those of the numbers that the lines show; what the rough '
         'rig holds is listed below and not in them.', '',
         '## Residuals', '',
@@ -83,6 +83,16 @@ def _parameter_table(c: Calibration) -> list[str]:
         rows.append(
             f'| {p.words} | {before} | {after} | {amount(change, p.unit)} | {told} |')
     return rows
+
+
+def _cut_rim(c: Calibration) -> list[str]:
+    """The rim is no free number, but a mirror that has shrunk cannot keep its rim."""
+    before, after = c.parameters.rough.rig.mirror.rim_radius, c.model.rig.mirror.rim_radius
+    if before is None or after is None or after == before:
+        return []
+    return [
+        f'The rim_radius was {1e3 * before:.4f} mm, more than the largest radius of the refined '
+        f'mirror; it was cut to that, {1e3 * after:.4f} mm.', '']
 
 
 def _shared(c: Calibration) -> str:

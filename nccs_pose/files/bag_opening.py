@@ -30,13 +30,13 @@ def open_bag(path: Path, stack: ExitStack) -> Any:
 
     :raises FileError: if there is no bag, or it cannot be read.
     """
-    if not path.exists():
-        raise FileError(f'{path}: no such bag.')
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        raise FileError(
-            f'{path}: is no bag, or its recording was cut off: it has no metadata.yaml '
-            '(`ros2 bag reindex` makes one).')
     with in_words(path):
+        if not path.exists():
+            raise FileError(f'{path}: no such bag.')
+        if path.is_dir() and not (path / 'metadata.yaml').exists():
+            raise FileError(
+                f'{path}: is no bag, or its recording was cut off: it has no metadata.yaml '
+                '(`ros2 bag reindex` makes one).')
         return stack.enter_context(AnyReader([path], default_typestore=jazzy_typestore()))
 
 
@@ -51,6 +51,9 @@ def in_words(path: Path, what: str = 'the bag') -> Iterator[None]:
         yield
     except (FileError, GeneratorExit):
         raise
+    except OSError as error:
+        raise FileError(
+            f'{error.filename or path}: cannot be read: {error.strerror or error}.') from error
     except Exception as error:
         reason = ' '.join(str(error).split()) or type(error).__name__
         raise FileError(

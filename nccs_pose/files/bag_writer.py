@@ -71,10 +71,10 @@ class BagWriter:
         self._writer: Any = None
 
     def __enter__(self) -> BagWriter:
-        if self.path.exists():
-            raise FileError(f'{self.path}: exists already; bags are never overwritten.')
-        writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
         try:
+            if self.path.exists():
+                raise FileError(f'{self.path}: exists already; bags are never overwritten.')
+            writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
             writer.open()
         except OSError as error:
             raise FileError(f'{self.path}: cannot be made: {error.strerror}.') from error

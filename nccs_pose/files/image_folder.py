@@ -21,6 +21,7 @@ from pathlib import Path
 
 import cv2
 from nccs_pose.errors import FileError, VisionError
+from nccs_pose.files.text_files import read_bytes
 from nccs_pose.vision.decode import decode_compressed, Image
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +31,18 @@ _PERIOD_NS = 100_000_000  # between images that carry no time
 
 
 def image_files(folder: str | Path) -> list[Path]:
-    """The images of a folder, sorted by name; empty if it holds none."""
+    """The images of a folder, sorted by name; empty if it holds none, or is a bag or no folder.
+
+    :raises FileError: if it cannot be read.
+    """
     folder = Path(folder)
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    try:
+        # A bag stays one with the pictures that somebody made of it.
+        if not folder.is_dir() or (folder / 'metadata.yaml').exists():
+            return []
+        return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    except OSError as error:
+        raise FileError(f'{folder}: cannot be read: {error.strerror or error}.') from error
 
 
 def read_images(files: list[Path]) -> Iterator[tuple[int, Image]]:
@@ -41,10 +51,7 @@ def read_images(files: list[Path]) -> Iterator[tuple[int, Image]]:
     :raises FileError: naming a file that is no image.
     """
     for number, path in enumerate(files):
-        try:
-            data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        except OSError as error:
-            raise FileError(f'{path}: cannot be read: {error.strerror or error}.') from error
+        data = np.frombuffer(read_bytes(path), dtype=np.uint8)
         try:
             image = _decode(data)
         except (VisionError, cv2.error) as error:

@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def as_title(path: str | Path) -> str:
+    """A path as a figure can show it: in UTF-8, and no dollar begins a formula."""
+    return str(path).encode('utf-8', 'backslashreplace').decode().replace('$', r'\$')
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG.
 

@@ -27,10 +27,12 @@ import sys
 from typing import Any
 
 from nccs_pose.errors import FileError
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import read_text, write_text
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
+
+_LARGEST = 2**20  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +83,13 @@ def read_saved_pose(path: str | Path) -> SavedPose | None:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding='utf-8'))
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise FileError(f'{path}: cannot be read: {error.strerror}') from error
+        text = read_text(path, _LARGEST)
+    except FileError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            return None
+        raise
+    try:
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FileError(f'{path}: is no saved pose: {error}') from error
     if not isinstance(content, dict):

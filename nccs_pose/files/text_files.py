@@ -11,31 +11,72 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Text written whole or not at all."""
+"""Files read whole and written whole; whatever is wrong with one is said in a sentence."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 import os
 from pathlib import Path
+import stat
 
 from nccs_pose.errors import FileError
+
+LARGEST = 2**28
+"""Bytes of a file that is read whole: a day of poses, hundreds of megapixels."""
+
+
+def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
+    """Read a whole file.
+
+    A pipe that nobody writes to would be waited for for ever, and a device may have no end.
+
+    :param most: bytes that it may hold.
+    :raises FileError: if it cannot be read, is no regular file or is too large; its cause is the
+        OSError, if there was one.
+    """
+    path = Path(path)
+    try:
+        with open(path, 'rb', opener=_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise FileError(f'{path}: cannot be read: it is a pipe or a device, no file.')
+            content = file.read(most + 1)
+    except OSError as error:
+        raise FileError(f'{path}: cannot be read: {error.strerror or error}.') from error
+    if len(content) > most:
+        raise FileError(f'{path}: cannot be read: it has more than {most} bytes.')
+    return content
+
+
+def read_text(path: str | Path, most: int = LARGEST) -> str:
+    """Read a whole file of UTF-8 text, with every kind of newline as one.
+
+    :raises FileError: as `read_bytes`, and if it is no UTF-8.
+    """
+    try:
+        text = read_bytes(path, most).decode('utf-8')
+    except UnicodeDecodeError as error:
+        raise FileError(f'{path}: cannot be read: it is not UTF-8 text.') from error
+    return text.replace('\r\n', '\n').replace('\r', '\n')
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` (UTF-8, newlines as they are), replacing the file in one step.
 
-    A reader, or a run that is interrupted, never sees half of it. Missing folders are made.
+    A reader, or a run that is interrupted, never sees half of it. Missing folders are made. What
+    UTF-8 cannot say, as of a file's name in another encoding, is written as an escape.
 
     :raises FileError: the file cannot be written; names it and the reason.
     """
     path = Path(path)
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.part')
+    temporary = _temporary(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_file():  # a pipe, /dev/null: never to be replaced
             temporary = path
-        with temporary.open('w', encoding='utf-8', newline='') as file:
+        with open(
+                temporary, 'w', encoding='utf-8', errors='backslashreplace', newline='',
+                opener=_without_waiting) as file:
             file.write(text)
         if temporary != path:
             os.replace(temporary, path)
@@ -52,11 +93,28 @@ def check_writable(path: str | Path) -> None:
     :raises FileError: if it is a folder, or its own folder cannot be made or written.
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileError(f'{path}: cannot be written: it is a folder.')
     try:
+        if path.is_dir():
+            raise FileError(f'{path}: cannot be written: it is a folder.')
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and not path.is_file():
+            if not os.access(path, os.W_OK):
+                raise FileError(f'{path}: cannot be written: Permission denied.')
+            return
+        temporary = _temporary(path)
+        temporary.touch()
+        temporary.unlink()
     except OSError as error:
         raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
-    if not os.access(path.parent, os.W_OK):
-        raise FileError(f'{path}: cannot be written: its folder is read-only.')
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; a pipe does not wait until somebody opens its other end."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
+    os.set_blocking(descriptor, True)
+    return descriptor
+
+
+def _temporary(path: Path) -> Path:
+    """Where a file is written before it takes its name, in the same folder."""
+    return path.with_name(f'.{path.name}.{os.getpid()}.part')

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from nccs_pose.errors import FileError
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.files.text_files import write_text
+from nccs_pose.files.text_files import read_text, write_text
 import numpy as np
 
 HEADER = '# timestamp x y z qx qy qz qw\n'
@@ -58,11 +58,7 @@ def read_tum(path: str | Path) -> Trajectory:
     :raises FileError: naming the file, the line, and what is wrong with it.
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not UTF-8 text'
-        raise FileError(f'{path}: cannot be read: {reason}.') from error
+    lines = read_text(path).splitlines()
     stamps, poses = [], []
     for number, line in enumerate(lines, start=1):
         text = line.split('#', 1)[0].replace(',', ' ')

@@ -31,12 +31,13 @@ from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import RigidTransform
 from nccs_pose.geometry.rig import Rig
+from nccs_pose.vision.colour import CONTRASTS
 import numpy as np
 
 DISTORTION_MODELS = ('plumb_bob', 'rational_polynomial')
 
-FARTHEST = 1e7
-"""Metres from the map's origin: enough for any grid on the earth, too little for millimetres."""
+_MOST_PIXELS = 16384  # width or height of an image
+_SAME = 1e-3  # metres between the ends of what is one line given twice
 
 _Value = TypeVar('_Value')
 
@@ -54,35 +55,40 @@ def load_rig(path: str | Path) -> Rig:
     cop = camera.numbers('cop', (3,), unit='m')
     rotation = camera.rotation('R_mirror_camera')
     camera.done()
-    transform = RigidTransform.from_rpy(
-        mounting.numbers('rpy', (3,), unit='rad'), mounting.numbers('translation', (3,), unit='m')
-    )
+    translation = mounting.numbers('translation', (3,), unit='m')
+    if translation[2] <= 0.0:
+        raise mounting.error(
+            'translation[2]', "must be above 0, the mirror's height over the floor, not "
+            f'{translation[2]}')
+    transform = RigidTransform.from_rpy(mounting.numbers('rpy', (3,), unit='rad'), translation)
     mounting.done()
     return _build(top, 'camera', lambda: Rig(quadric, pinhole, cop, rotation, transform))
 
 
-def load_map(path: str | Path) -> LineMap:
+def load_map(path: str | Path, *, tapes: bool = True) -> LineMap:
     """Read a map: `lines` with start and end, and their common width, colour and frame.
 
+    :param tapes: refuse a line that no image shows: above the floor, or without a width.
     :raises FileError: one sentence that names the file, the key, the value and what is accepted.
     """
     top = read_yaml(path)
     frame = top.text('frame', 'map')
     width = top.number('width', 0.0, unit='m', low=0.0)
-    colour = top.text('colour', 'green')
+    colour = top.text('colour', 'green', choices=tuple(CONTRASTS))
     sections = top.sections('lines')
     top.done()
-    lines: list[Line] = []
-    for index, section in enumerate(sections):
-        line = _line(section, width, colour, default_name=f'line{index}')
-        if line.name in [other.name for other in lines]:
-            raise section.error('name', f'is given twice in the map: {line.name!r}')
-        twin = next((other for other in lines if _same(line, other)), None)
-        if twin is not None:
-            raise section.error('', f'(line {line.name!r}) is line {twin.name!r} once more')
-        lines.append(line)
+    lines = [
+        _line(section, width, colour, default_name=f'line{index}')
+        for index, section in enumerate(sections)]
     if len(lines) < 2:
         raise top.error('lines', f'must hold at least 2 lines, it holds {len(lines)}')
+    _refuse_repetition(lines, sections)
+    for line, section in zip(lines, sections):
+        if tapes and not line.is_tape:
+            raise section.error(
+                '', f'(line {line.name!r}) is no tape on the floor, and images show nothing else: '
+                f'its width must be above 0 m, not {line.width:g}, and its z be 0 m, not '
+                f'{line.start[2]:g} and {line.end[2]:g}')
     return _build(top, 'lines', lambda: LineMap(tuple(lines), frame=frame))
 
 
@@ -136,8 +142,8 @@ def _mirror(section: Section) -> QuadricMirror:
 
 
 def _camera(section: Section) -> PinholeCamera:
-    width = section.integer('width')
-    height = section.integer('height')
+    width = section.integer('width', 1, _MOST_PIXELS)
+    height = section.integer('height', 1, _MOST_PIXELS)
     K = section.numbers('K', (9,), unit='px').reshape(3, 3)
     if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise section.error('K', f'must have focal lengths above 0, not {K[0, 0]} and {K[1, 1]}')
@@ -155,25 +161,32 @@ def _line(section: Section, width: float, colour: str, default_name: str) -> Lin
     name = section.text('name', default_name)
     start, end = _point(section, 'start'), _point(section, 'end')
     width = section.number('width', width, unit='m', low=0.0)
-    colour = section.text('colour', colour)
+    colour = section.text('colour', colour, choices=tuple(CONTRASTS))
     section.done()
     if np.array_equal(start, end):
         raise section.error('', f'(line {name!r}) has no length: start and end are {start}')
     return _build(section, '', lambda: Line(start, end, width, colour, name))
 
 
-def _same(line: Line, other: Line) -> bool:
-    """Whether two lines have their ends in the same places."""
-    ends, theirs = (np.array([each.start, each.end]) for each in (line, other))
-    return any(np.allclose(ends, there, rtol=0.0, atol=1e-3) for there in (theirs, theirs[::-1]))
+def _refuse_repetition(lines: list[Line], sections: list[Section]) -> None:
+    """Refuse a name given twice, and a line whose ends are where another's are."""
+    names: set[str] = set()
+    ends = np.array([(line.start, line.end) for line in lines])  # (L, 2, 3)
+    for index, (line, section) in enumerate(zip(lines, sections)):
+        if line.name in names:
+            raise section.error('name', f'is given twice in the map: {line.name!r}')
+        names.add(line.name)
+        apart = np.minimum(*(
+            np.abs(ends[:index] - there).max(axis=(1, 2), initial=0.0)
+            for there in (ends[index], ends[index, ::-1])))
+        if (apart <= _SAME).any():
+            twin = lines[int(apart.argmin())]
+            raise section.error('', f'(line {line.name!r}) is line {twin.name!r} once more')
 
 
 def _point(section: Section, key: str) -> np.ndarray:
     """Two numbers, on the ground, or three."""
     point = section.numbers(key, (2, 3), unit='m')
-    if np.abs(point).max() > FARTHEST:
-        raise section.error(
-            key, f'must lie within {FARTHEST:g} m of the origin, not at {point.tolist()}')
     return point if point.size == 3 else np.append(point, 0.0)
 
 

@@ -27,10 +27,16 @@ import re
 from typing import Any
 
 from nccs_pose.errors import FileError
+from nccs_pose.files.text_files import read_text
 import numpy as np
 import yaml
 
+FARTHEST = 1e7
+"""What no number of a file exceeds. In metres from the map's origin it is enough for any grid on
+the earth, and too little for millimetres."""
+
 _REQUIRED: Any = object()
+_LARGEST = 2**23  # bytes; a map of a thousand lines has a hundredth of it
 
 
 class _CoreLoader(yaml.SafeLoader):
@@ -81,11 +87,7 @@ def read_yaml(path: str | Path) -> Section:
         file and line.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not UTF-8 text'
-        raise FileError(f'{path}: cannot be read: {reason}.') from error
+    text = read_text(path, _LARGEST)
     try:
         content = yaml.load(text, Loader=_CoreLoader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
@@ -183,10 +185,10 @@ class Section:
             raise self.error(key, f'must be {accepted}, not {describe(value)}')
         return number
 
-    def integer(self, key: str, above: int = 0) -> int:
-        accepted = f'a whole number above {above}'
+    def integer(self, key: str, low: int, high: int) -> int:
+        accepted = f'a whole number from {low} to {high}'
         value = self.value(key, accepted=accepted)
-        if not isinstance(value, int) or isinstance(value, bool) or value <= above:
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
             raise self.error(key, f'must be {accepted}, not {describe(value)}')
         return value
 
@@ -247,4 +249,7 @@ class Section:
             number = math.inf
         if not math.isfinite(number):
             raise self.error(key, f'must be {accepted}, finite, not {describe(value)}')
+        if abs(number) > FARTHEST:
+            raise self.error(
+                key, f'must be {accepted} of at most {FARTHEST:g} in size, not {describe(value)}')
         return number

@@ -67,12 +67,17 @@ class QuadricMirror:
         if rim is not None and self.A > 0.0 and rim**2 > self._depth * (1.0 + 1e-9):
             raise GeometryError(
                 f'mirror: rim_radius = {rim} exceeds the largest radius '
-                f'{math.sqrt(self._depth):.6g} of the surface')
+                f'{self.largest_radius:.6g} of the surface')
 
     @property
     def _depth(self) -> float:
         """C + B^2 / (4 A): the right side of Omega once it is centred; C for a paraboloid."""
         return self.C + self.B**2 / (4.0 * self.A) if self.A != 0.0 else self.C
+
+    @property
+    def largest_radius(self) -> float:
+        """The surface's radius at its equator; infinite where it has none."""
+        return math.sqrt(self._depth) if self.A > 0.0 else math.inf
 
     @property
     def kind(self) -> str:

@@ -24,10 +24,10 @@ from nav_msgs.msg import Odometry
 from nccs_pose.errors import FrameRefusedError
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.geometry.camera import PinholeCamera
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.camera_check import contradiction
 from nccs_pose.ros.conversions import read_initial_pose, read_odometry
 from nccs_pose.ros.interface import CAMERA_INFO, Endpoint, INITIAL_POSE, ODOM
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.pose_keeper import PoseKeeper
 from nccs_pose.ros.qos import overridable, profile
 from rclpy.node import Node

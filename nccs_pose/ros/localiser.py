@@ -32,8 +32,8 @@ def main() -> int:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _leave)
     from nccs_pose.estimation.options import LocaliserOptions
+    from nccs_pose.node_options import NodeOptions
     from nccs_pose.ros.command_line import read_command_line
-    from nccs_pose.ros.node_options import NodeOptions
 
     read_command_line(
         'localiser', 'Localise a robot from images of floor lines in a curved mirror.',

@@ -33,13 +33,13 @@ from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.rig import Rig
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import diagnostics
 from nccs_pose.ros.calibration_watch import CalibrationWatch
 from nccs_pose.ros.image_stream import ImageStream
 from nccs_pose.ros.inputs import Inputs
 from nccs_pose.ros.interface import DIAGNOSTICS, RELOCALISE, SET_PAUSED
 from nccs_pose.ros.lifecycle import answer_every_request, in_words
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.pose_keeper import PoseKeeper

@@ -23,11 +23,11 @@ from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.rig import Rig
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.conversions import image_message, pose_message
 from nccs_pose.ros.debug_image import draw_debug_image
 from nccs_pose.ros.interface import DEBUG_IMAGE, MARKERS, POSE
 from nccs_pose.ros.markers import marker_array
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.qos import overridable, profile
 from nccs_pose.ros.transforms import TransformOutput
 import numpy as np

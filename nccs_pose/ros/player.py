@@ -23,11 +23,11 @@ import importlib
 import sys
 import time
 
-from nccs_pose.argument_types import positive, seconds
+from nccs_pose.argument_types import number, seconds
 from nccs_pose.errors import FileError, NccsPoseError
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
-from nccs_pose.ros.start import initialise, leave, told_to_end
+from nccs_pose.ros.start import initialise, leave, StartError, told_to_end
 from nccs_pose.ros.transport import use_large_images
 import rclpy
 from rclpy.duration import Duration
@@ -76,7 +76,8 @@ class Player:
     def __init__(self, node: Node, bag: SerialisedBag, playback: Playback) -> None:
         """Create the publishers.
 
-        :raises FileError: if a topic asked for is not in the bag, or none can be played.
+        :raises FileError: if a topic asked for is not in the bag, or nothing can be played.
+        :raises StartError: if ROS refuses a topic, e.g. as remapped to one of another type.
         """
         self._node = node
         self._bag = bag
@@ -95,6 +96,10 @@ class Player:
                 self._advertise(topic)
         if not self._publishers:
             raise FileError(f'{bag.path}: no topic of it can be played')
+        if next(bag.messages(tuple(self._publishers), self._first_ns), None) is None:
+            raise FileError(
+                f'{bag.path}: --start-offset {playback.start_offset:g}: leaves nothing to play, '
+                f'the bag lasts {1e-9 * (bag.end_ns - bag.start_ns):.1f} s')
         self._clock = node.create_publisher(Clock, '/clock', 10) if playback.clock else None
 
     def _advertise(self, topic: BagTopic) -> None:
@@ -109,8 +114,18 @@ class Player:
         profile = QoSProfile(depth=100 if topic.latched else 10)
         if topic.latched:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        self._publishers[topic.name] = self._node.create_publisher(kind, topic.name, profile)
+        try:
+            publisher = self._node.create_publisher(kind, topic.name, profile)
+        except RuntimeError as error:  # base of every RCLError
+            raise StartError(
+                f'{topic.name} cannot be published: {" ".join(str(error).split())}') from error
+        self._publishers[topic.name] = publisher
         self.sent[topic.name] = 0
+
+    @property
+    def _first_ns(self) -> int:
+        """Where in the bag it begins, nanoseconds."""
+        return self._bag.start_ns + round(1e9 * self._playback.start_offset)
 
     def subscribers(self, topic: str) -> int:
         """How many subscribe a topic."""
@@ -128,7 +143,7 @@ class Player:
         self._wait_until_taken()
 
     def _play_once(self, on_sent: OnSent | None) -> None:
-        bag_start = self._bag.start_ns + round(1e9 * self._playback.start_offset)
+        bag_start = self._first_ns
         wall_start = time.monotonic()
         for topic, received_ns, data in self._bag.messages(tuple(self._publishers), bag_start):
             due = wall_start + 1e-9 * (received_ns - bag_start) / self._playback.rate
@@ -176,7 +191,12 @@ def wait_for_subscribers(player: Player, topics: Sequence[str], timeout: float) 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `ros2 run nccs_pose play BAG`."""
     arguments = sys.argv[1:] if argv is None else list(argv)
-    options = _parser().parse_args(remove_ros_args(['play', *arguments])[1:])
+    try:
+        words = remove_ros_args(['play', *arguments])[1:]
+    except RuntimeError as error:  # base of every RCLError
+        print(f'play: cannot start: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    options = _parser().parse_args(words)
     playback = Playback(
         options.rate, options.loop, options.start_offset, options.clock,
         tuple(options.topics or ()))
@@ -208,7 +228,8 @@ def _parser() -> argparse.ArgumentParser:
         prog='play', description='Publish the topics of a rosbag2 with their recorded timing. '
         'Topics are remapped as of any node: --ros-args -r /camera/image_raw:=/image.')
     parser.add_argument('bag', help='folder of the bag')
-    parser.add_argument('--rate', type=positive, default=1.0, help='speed factor (default 1)')
+    parser.add_argument('--rate', type=number(0.001, 1000.0), default=1.0,
+                        help='speed factor (default 1)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
     parser.add_argument('--start-offset', type=seconds, default=0.0, metavar='S',
                         help='seconds of the bag to leave out')

@@ -25,7 +25,7 @@ from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.files.saved_pose import map_hash, read_saved_pose, SavedPose, write_saved_pose
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.ros.node_options import NodeOptions
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.resources import expanded
 import numpy as np
 

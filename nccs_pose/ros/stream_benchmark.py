@@ -35,6 +35,7 @@ import time
 import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nccs_pose.argument_types import number
 from nccs_pose.errors import NccsPoseError
 from nccs_pose.evaluation.tables import table
 from nccs_pose.files.yaml_files import load_map, load_rig
@@ -140,8 +141,10 @@ class Listener(Node):
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `ros2 run nccs_pose stream_benchmark`."""
     parser = argparse.ArgumentParser(prog='stream_benchmark', description=__doc__)
-    parser.add_argument('--seconds', type=float, default=60.0, help='length (default 60)')
-    parser.add_argument('--rate', type=float, default=30.0, help='images a second (default 30)')
+    parser.add_argument('--seconds', type=number(1.0, 86400.0, 's'), default=60.0,
+                        help='length (default 60)')
+    parser.add_argument('--rate', type=number(0.1, 1000.0, 'Hz'), default=30.0,
+                        help='images a second (default 30)')
     parser.add_argument('--formats', nargs='+', choices=('raw', 'jpeg'), default=['raw', 'jpeg'])
     options = parser.parse_args(argv)
     use_large_images()

@@ -29,9 +29,9 @@ from typing import Any
 from geometry_msgs.msg import TransformStamped
 from nccs_pose.errors import FrameRefusedError, OptionError
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.conversions import ns_to_stamp, planar_to_pose, pose_to_planar, yaw_quaternion
 from nccs_pose.ros.inputs import waiting
-from nccs_pose.ros.node_options import NodeOptions
 from rclpy.node import Node
 from rclpy.time import Time
 

@@ -119,7 +119,10 @@ def test_player_loops_until_it_is_stopped(world):
 @pytest.mark.parametrize(('arguments', 'words'), [
     (['no/such/bag'], 'no/such/bag: no such bag'),
     ([BAG, '--topics', '/nothing'], 'has no topic /nothing'),
-    ([BAG, '--rate', '-1'], 'must be greater than 0'),
+    ([BAG, '--rate', '-1'], "'-1' is no number from 0.001 to 1000"),
+    ([BAG, '--ros-args', '-r', 'bad'], 'cannot start: Failed to parse ROS arguments'),
+    ([BAG, '--ros-args', '-r', '/odom:=/camera/camera_info'], 'cannot be published: '),
+    ([BAG, '--loop', '--start-offset', '1e9'], 'leaves nothing to play, the bag lasts 30.5 s'),
     ([BAG, '--wait-for', '/tf_statics'], '/tf_statics'),
 ])
 def test_player_says_what_it_cannot_play(world, arguments, words):

@@ -33,10 +33,10 @@ from nav_msgs.msg import Odometry
 from nccs_pose.errors import FrameRefusedError, OptionError
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import conversions as c
 from nccs_pose.ros.camera_check import contradiction
 from nccs_pose.ros.diagnostics import pose_status
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message

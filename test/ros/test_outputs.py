@@ -27,11 +27,11 @@ from nccs_pose.calibration.monitor import Condition, Verdict
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import calibration_watch, diagnostics
 from nccs_pose.ros import outputs as outputs_module
 from nccs_pose.ros.conversions import decode
 from nccs_pose.ros.markers import ELLIPSE_SIGMAS, marker_array
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.statuses import STATUSES
 from nccs_pose.simulation.scene import arena_map, arena_rig

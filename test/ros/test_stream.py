@@ -159,3 +159,15 @@ def test_a_jump_of_the_stamps_and_relocalise_start_the_search_anew(world, arena)
     assert user.wait(lambda: searched in user.value('localiser: pose', 'reason')), node.output
     assert user.value('localiser: calibration', 'condition') == 'unknown'
     assert user.count('refused') == user.count('errors') == 0
+
+
+@pytest.mark.parametrize('arguments', [
+    ('--seconds', 'nan'), ('--seconds', '-1'), ('--rate', '0'), ('--rate', 'inf')])
+def test_the_benchmark_names_a_number_out_of_its_range(arguments, capsys):
+    from nccs_pose.ros.stream_benchmark import main
+
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert f'argument {arguments[0]}: {arguments[1]!r} is no number from' in (
+        capsys.readouterr().err)

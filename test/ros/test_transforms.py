@@ -26,8 +26,8 @@ pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 from geometry_msgs.msg import TransformStamped
 from nccs_pose.errors import OptionError
 from nccs_pose.geometry.pose import Pose2
+from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.conversions import ns_to_stamp, yaw_quaternion
-from nccs_pose.ros.node_options import NodeOptions
 from nccs_pose.ros.transforms import TransformOutput
 import numpy as np
 from rclpy.time import Time
