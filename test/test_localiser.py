@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 import zlib
 
-from nccs_pose.errors import FrameRefusedError, GeometryError
+from nccs_pose.errors import EstimationError, FrameRefusedError, GeometryError
 from nccs_pose.estimation.aligner import Aligner, SPACING
 from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.estimate import Estimate, State
@@ -649,6 +649,20 @@ def test_what_an_image_showed_elsewhere_is_not_coasted_over() -> None:
     assert drive.right(again)
 
 
+def test_after_an_image_that_shows_none_of_what_is_expected_nothing_is_coasted_over() -> None:
+    """Nor any place at all; a pose that was given up does not come back in the dark."""
+    drive = Drive(SCENE, Pose2(0.5, 0.1, 0.3))
+    for _ in range(3):
+        assert drive.go().state is State.TRACKING
+    drive.scene = replace(SCENE, line_map=LineMap((
+        _line((-0.6, -0.8), (1.6, -0.5)), _line((1.9, 0.9), (-0.3, 1.0)))))
+    for change in (lambda image: image, _black, _black):
+        answer = drive.go(change=change)
+        assert (answer.state, answer.candidates) == (State.LOST, ())
+    drive.scene = SCENE
+    assert drive.right(drive.go())
+
+
 def test_odometry_bridges_darkness_for_a_while_and_no_longer() -> None:
     drive = Drive(SCENE, Pose2(-0.5, 0.1, 0.3), LocaliserOptions(coast_time=0.45))
     for _ in range(3):
@@ -867,6 +881,19 @@ def test_a_pose_that_was_given_takes_up_wheels_that_come_later() -> None:
     for _ in range(14):
         assert drive.go(Pose2(0.02, 0.0, 0.05), change=_black).pose is None
     assert drive.right(drive.go())
+
+
+@pytest.mark.parametrize('covariance', [
+    np.zeros((3, 3)), np.full((3, 3), np.nan), -np.eye(3), np.eye(2), np.diag([1.0, 1.0, 0.0])])
+def test_a_covariance_that_is_none_is_refused_and_changes_nothing(covariance: np.ndarray) -> None:
+    drive = Drive(SCENE, Pose2(0.5, 0.1, 0.3))
+    drive.go()
+    with pytest.raises(EstimationError, match='no covariance'):
+        drive.localiser.set_prior(Pose2(9.0, 9.0, 0.0), covariance)
+    after = drive.go()
+    assert after.reason == 'the pose explains the image'
+    with pytest.raises(ValueError, match='read-only'):
+        after.covariance *= 4.0
 
 
 def test_a_pose_that_is_given_as_the_clock_goes_back_is_of_the_new_time() -> None:

@@ -48,7 +48,7 @@ class Follower:
         self._frames_since_check = options.check_every
 
     def begin(self) -> None:
-        """Start anew, with a pose that the whole image has shown."""
+        """Start anew, from a pose that the search of a whole image has shown."""
         self._frames_since_check = 0
 
     def follow(

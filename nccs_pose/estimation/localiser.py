@@ -26,7 +26,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 
-from nccs_pose.errors import FrameRefusedError, GeometryError
+from nccs_pose.errors import EstimationError, FrameRefusedError, GeometryError
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import OPEN
@@ -95,7 +95,7 @@ class Localiser:
                     f'width {line.width:g} m, is no tape on the floor: images show only those '
                     'with z = 0 and a width')
         self._map = line_map
-        self.options = options
+        self._options = options
         self._colours: tuple[LineColour, ...] = ()
         self._table = FloorTable(rig, options.reach)
         self._symmetries = map_symmetries(line_map)[1:]
@@ -104,15 +104,20 @@ class Localiser:
         self.update_options(options)
         self.reset()
 
+    @property
+    def options(self) -> LocaliserOptions:
+        """What it goes by; changed by :meth:`update_options`."""
+        return self._options
+
     def update_options(self, options: LocaliserOptions) -> None:
         """Take over new options; the pose is kept.
 
         A new reach needs new tables and is taken over by a new localiser only.
         """
-        if options.blur != self.options.blur:
+        if options.blur != self._options.blur:
             self._colours = tuple(
                 replace(colour, blur=options.blur) for colour in self._colours)
-        self.options = options
+        self._options = options
         aligner = Aligner(self._table, self._map, options)
         self._nominal_colours = aligner.nominal_colours
         self._searcher = Searcher(self._table, self._map, options)
@@ -137,7 +142,8 @@ class Localiser:
         self._past: tuple[Track, ...] = ()
         self._given: GivenPose | None = None
         self._ever_tracked = False
-        self._follower.begin()
+        # Whether an image has shown another place than expected since the last pose.
+        self._shaken = False
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -162,9 +168,15 @@ class Localiser:
 
         :param pose: T_map_base.
         :param covariance: of (x, y, yaw) (3, 3), positive definite.
+        :raises EstimationError: if the covariance is none; everything stays as it was.
         """
+        given = np.array(covariance, dtype=float)
+        if given.shape != (3, 3) or not np.isfinite(given).all() or (
+                np.linalg.eigvalsh(0.5 * (given + given.T))[0] <= 0.0):
+            raise EstimationError(
+                f'{given.tolist()} is no covariance of (x, y, yaw): 3 x 3, positive definite')
         self.relocalise()
-        self._given = GivenPose(pose, np.array(covariance, dtype=float))
+        self._given = GivenPose(pose, given)
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
         """Take a sample of wheel odometry, T_odom_base.
@@ -250,7 +262,7 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = the_one_expected(held, sifted, told, prediction, self.options)
+        chosen = the_one_expected(held, sifted, told, prediction, self._options)
         if chosen is not None:
             words = 'found by searching the whole image'
             if len(held) > 1:
@@ -260,7 +272,7 @@ class Localiser:
         hypotheses, more = left_open(hypotheses, held, sifted)
         self._open = OpenPoses(hypotheses, stamp_ns, self._now)
         best = hypotheses[0]
-        if ambiguity(hypotheses) <= self.options.ambiguity_ratio and (
+        if ambiguity(hypotheses) <= self._options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(
@@ -289,7 +301,7 @@ class Localiser:
         if given is not None:
             return Told(given.pose, given.carried, _PRIOR_GATE)
         if prediction is not None:
-            return Told(prediction.pose, prediction.covariance, self.options.innovation_gate)
+            return Told(prediction.pose, prediction.covariance, self._options.innovation_gate)
         return None
 
     def _tracking(
@@ -307,6 +319,8 @@ class Localiser:
         unobserved = unobserved_directions(
             alignment.refinement.information, alignment.pose, limit=OPEN)
         seen_ns, seen_way = stamp_ns, None if self._now is None else self._now.way
+        # Whoever is told of it shares it with the track.
+        covariance.setflags(write=False)
         last = self._track
         if unobserved and last is not None:
             seen_ns, seen_way = last.seen_ns, last.seen_way
@@ -320,6 +334,9 @@ class Localiser:
         self._colours = alignment.colours
         self._given = None
         self._refuted_ns = None
+        self._shaken = False
+        if held is not None:
+            self._follower.begin()
         self._open = OpenPoses()
         self._doubts = settled_doubts(self._doubts, alignment)
         shown = lines_shown(alignment)
@@ -346,7 +363,7 @@ class Localiser:
             (*(Candidate(h.pose, h.mean) for h in hypotheses), *more), key=lambda c: -c.score))
         ratio = ambiguity(hypotheses)
         quality = _quality(held[0], ratio)
-        if ratio > self.options.ambiguity_ratio:
+        if ratio > self._options.ambiguity_ratio:
             state, words = State.AMBIGUOUS, (
                 f'{len(poses)} poses explain the image about equally well (the second scores '
                 f'{ratio:.2f} of the first)')
@@ -371,12 +388,15 @@ class Localiser:
             self._doubts |= {against.line}
         if refused.alignment is not None:
             doubted = Doubted(refused.alignment.pose, refused.alignment.points)
-        if track is not None and prediction is not None and prediction.by_odometry and not (
-                contradicted or self._shaken(prediction, segments)):
+        if prediction is not None:
+            self._shaken |= (
+                contradicted or bool(self._open) or self._shows_another(prediction, segments))
+        if track is not None and prediction is not None and (
+                prediction.by_odometry and not self._shaken):
             age = (stamp_ns - track.stamp_ns) * 1e-9
             covariance = prediction.covariance
             variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), covariance[2, 2])
-            if age <= self.options.coast_time and variance <= self.options.coast_sigma ** 2:
+            if age <= self._options.coast_time and variance <= self._options.coast_sigma ** 2:
                 return Estimate(
                     stamp_ns, State.COASTING,
                     f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
@@ -387,8 +407,10 @@ class Localiser:
             stamp_ns, state, missing, times=watch.times, doubted=doubted,
             candidates=tuple(Candidate(h.pose, h.mean) for h in hypotheses))
 
-    def _shaken(self, prediction: Prediction, segments: tuple[FloorSegment, ...]) -> bool:
-        """Whether an image shows another place than expected, now or since the last pose."""
+    def _shows_another(
+        self, prediction: Prediction, segments: tuple[FloorSegment, ...],
+    ) -> bool:
+        """Whether an image shows another place than expected."""
         if self._open:
             return True
         _, claimed = self._searcher.score(prediction.pose, segments)

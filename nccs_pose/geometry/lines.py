@@ -50,6 +50,8 @@ class Line:
             if point.shape != (3,) or not np.isfinite(point).all():
                 raise GeometryError(
                     f'line {self.name!r}: {key} {point.tolist()} is not three finite numbers')
+            # What follows from the ends is kept.
+            point.setflags(write=False)
             object.__setattr__(self, key, point)
         if self.length < 1e-6:
             raise GeometryError(
