@@ -50,9 +50,9 @@ _ALIKE = 0.8
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
-# So much longer than the longest tape they are several in a row, this far apart, metres.
+# So much longer than the longest tape they are several in a row, further apart than this, metres.
 _TOO_LONG = 1.1
-_ROW_GAP = 0.12
+ROW_GAP = 0.12
 # Where something is this close beside a strip, metres, it does not stand free. If more than this
 # part of what lies in the strip is there, the strip is part of a larger thing, unless it stands
 # free for so long as a line has to be.
@@ -296,7 +296,7 @@ def _one_tape(
     """Of a strip that is longer than any tape the heaviest part between two gaps."""
     if math.isinf(longest) or np.ptp(along[inside]) <= _TOO_LONG * longest:
         return inside
-    return _longest_run(points, along, inside, _ROW_GAP)
+    return _longest_run(points, along, inside, ROW_GAP)
 
 
 def _longest_run(

@@ -25,6 +25,7 @@ from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
@@ -70,6 +71,8 @@ class Searcher:
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
+        # Strips run on over the joints of lines that the map draws in pieces.
+        line_map = whole_lines(line_map)
         self._associator = Associator(line_map, table)
         self._options = options
         self._widths: dict[str, float] = {}
