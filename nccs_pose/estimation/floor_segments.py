@@ -168,6 +168,15 @@ def floor_segments(
     return tuple(segments)
 
 
+def widest_gap(longest: float, ends: float) -> float:
+    """Widest gap in a row of tapes that strips run over, with so much of them beyond it, metres.
+
+    :param longest: length of the longest of the tapes, metres.
+    :param ends: how much of a strip is on either side, metres.
+    """
+    return max(ROW_GAP, min(_LONGEST_GAP, _TOO_LONG * longest - 2.0 * ends))
+
+
 def _candidates(
     points: FloorPoints, width: float,
 ) -> tuple[Array, Array, NDArray[np.intp]]:

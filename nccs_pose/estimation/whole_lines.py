@@ -33,15 +33,16 @@ from numpy.typing import NDArray
 _ASIDE = 0.2
 
 
-def whole_lines(line_map: LineMap) -> LineMap:
+def whole_lines(line_map: LineMap, gap: float = ROW_GAP) -> LineMap:
     """A map with those of its lines joined that an image shows as one, however near they are.
 
     They have the same colour, are in line, and touch, overlap, or leave no gap that images show
     for certain. Wider gaps are kept, since they tell one place from another.
 
+    :param gap: another one, over which lines are joined, metres.
     :returns: the map itself where there are no such lines.
     """
-    near = _may_be_one(line_map)
+    near = _may_be_one(line_map, gap)
     # The lines that each is a part of.
     wholes = [[k] for k in range(len(line_map))]
     for a, b in np.argwhere(np.triu(near, 1)).tolist():
@@ -56,15 +57,15 @@ def whole_lines(line_map: LineMap) -> LineMap:
         tuple(_joined([line_map[k] for k in parts]) for parts in joined), line_map.frame)
 
 
-def _may_be_one(line_map: LineMap) -> NDArray[np.bool_]:
+def _may_be_one(line_map: LineMap, gap: float) -> NDArray[np.bool_]:
     """Which lines go on as which others, about in line with them (L, L)."""
     starts, directions = line_map.starts[:, None, :2], line_map.directions[:, None, :2]
     # Where the others' ends are as seen along each line (2, L, L).
     offset = np.stack([line_map.starts, line_map.ends])[:, None, :, :2] - starts
     along = (offset * directions).sum(axis=3)
     across = offset[..., 1] * directions[..., 0] - offset[..., 0] * directions[..., 1]
-    reached = (along.min(axis=0) < line_map.lengths[:, None] + ROW_GAP) & (
-        along.max(axis=0) > -ROW_GAP)
+    reached = (along.min(axis=0) < line_map.lengths[:, None] + gap) & (
+        along.max(axis=0) > -gap)
     # A short one does not tell where a long one has its ends.
     near = reached & (np.abs(across).max(axis=0) < 4.0 * _ASIDE * line_map.widths)
     colours = np.array([line.colour for line in line_map])
