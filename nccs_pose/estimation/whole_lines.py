@@ -42,19 +42,29 @@ def whole_lines(line_map: LineMap, gap: float = ROW_GAP) -> LineMap:
     :param gap: another one, over which lines are joined, metres.
     :returns: the map itself where there are no such lines.
     """
+    wholes = _wholes(line_map, gap)
+    joined = [parts for k, parts in enumerate(wholes) if k == min(parts)]
+    if len(joined) == len(line_map):
+        return line_map
+    return LineMap(
+        tuple(_joined([line_map[k] for k in parts]) for parts in joined), line_map.frame)
+
+
+def first_pieces(line_map: LineMap) -> NDArray[np.intp]:
+    """The first of the lines of a map that an image shows as one with each (L,): its number."""
+    return np.array([min(parts) for parts in _wholes(line_map, ROW_GAP)])
+
+
+def _wholes(line_map: LineMap, gap: float) -> list[list[int]]:
+    """The lines of a map that each makes one line with, itself among them."""
     near = _may_be_one(line_map, gap)
-    # The lines that each is a part of.
     wholes = [[k] for k in range(len(line_map))]
     for a, b in np.argwhere(np.triu(near, 1)).tolist():
         both = [*wholes[a], *wholes[b]]
         if wholes[a] is not wholes[b] and _are_in_line([line_map[k] for k in both]):
             for k in both:
                 wholes[k] = both
-    joined = [parts for k, parts in enumerate(wholes) if k == min(parts)]
-    if len(joined) == len(line_map):
-        return line_map
-    return LineMap(
-        tuple(_joined([line_map[k] for k in parts]) for parts in joined), line_map.frame)
+    return wholes
 
 
 def _may_be_one(line_map: LineMap, gap: float) -> NDArray[np.bool_]:
