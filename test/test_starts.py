@@ -20,11 +20,15 @@ from pathlib import Path
 from typing import Any
 
 from nccs_pose.cli import main
+from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.estimate import Candidate, Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.estimation.verdict import lines_used
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
+from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.renderer import render
@@ -109,6 +113,19 @@ def test_a_symmetric_map_drawn_in_pieces_gives_both_poses(count: int, gap: float
         assert len(estimate.candidates) == 2
         for twin in (pose, Pose2(0.0, 0.0, np.pi) @ pose):
             assert any(same_pose(c.pose, twin) for c in estimate.candidates)
+
+
+@pytest.mark.parametrize('gap', [0.0, 0.05])
+def test_a_line_in_pieces_is_one_line_to_rest_on(gap: float) -> None:
+    line_map = _in_pieces(MARKED, 3, gap)
+    scene = replace(ideal_scene(640, noise=0.02), line_map=line_map)
+    pose = Pose2(0.1, -0.2, 0.7)
+    aligner = Aligner(FloorTable(scene.rig, 5.0), line_map, LocaliserOptions())
+    alignment = aligner.align(
+        render(scene, pose, np.random.default_rng(1)), pose, aligner.nominal_colours)
+    assert alignment is not None
+    assert len(alignment.lines) > 10
+    assert lines_used(alignment) == 5
 
 
 def test_among_many_lines_every_image_gives_the_pose() -> None:
