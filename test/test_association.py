@@ -28,13 +28,15 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines
 from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import as_points, FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.simulation.large_maps import dashes, lattice
 from nccs_pose.simulation.renderer import render
-from nccs_pose.simulation.scene import arena_rig, ideal_scene, Obstacle
+from nccs_pose.simulation.scene import arena_rig, arena_scene, ideal_scene, Obstacle
 from nccs_pose.vision.segment import chromatic_mask, find_blobs
 import numpy as np
 import pytest
@@ -470,6 +472,78 @@ def test_random_maps_and_the_arena_have_no_symmetry() -> None:
     assert len(map_symmetries(ideal_scene().line_map)) == 1
     for seed in range(20):
         assert len(map_symmetries(_random_map(np.random.default_rng(seed), 5))) == 1
+
+
+# ---------------------------------------------------------------- lines drawn in pieces
+
+
+def test_a_map_without_pieces_is_left_as_it_is() -> None:
+    # Side by side, at an angle, of another colour, apart, and in line at a crossing.
+    others = LineMap((
+        _line((0.0, 0.0), (2.0, 0.0)), _line((2.0, 0.03), (4.0, 0.03)),
+        _line((-1.0, 0.03), (0.0, 0.0)), _line((-2.0, 0.0), (0.0, 0.0), 'red'),
+        _line((2.2, 0.0), (3.0, 0.0)), _line((2.0, 0.0), (2.0, 1.0))))
+    for line_map in (others, arena_scene(640).line_map, dashes(), lattice(), _rectangle(4.0, 3.0)):
+        assert whole_lines(line_map) is line_map
+
+
+@pytest.mark.parametrize('gap', [-0.1, 0.0, 0.05, 0.11])
+@pytest.mark.parametrize('turn', [0.0, 2.1, -0.7])
+def test_a_line_in_pieces_is_one_line(gap: float, turn: float) -> None:
+    ends = [(0.0, 0.7), (0.7 + gap, 0.9 + gap), (4.0, 0.9 + 2.0 * gap)]
+    pieces = [
+        _line((0.0, 0.003), (0.7, 0.0)), _line(*((x, -0.002) for x in ends[1])),
+        _line(*((x, 0.001) for x in ends[2])), _line((1.0, 0.0), (1.0, 2.0))]
+    whole = whole_lines(LineMap(tuple(
+        line.transformed(Pose2(1.0, 2.0, turn)) for line in pieces)))
+    assert len(whole) == 2
+    back = Pose2(1.0, 2.0, turn).inverse()
+    corners = sorted(back.apply(end[:2]).round(9).tolist() for end in (
+        whole[0].start, whole[0].end))
+    assert corners == [[0.0, 0.003], [4.0, 0.001]]
+    assert (whole[1].start == pieces[3].transformed(Pose2(1.0, 2.0, turn)).start).all()
+
+
+def test_no_line_is_made_of_pieces_of_a_curve() -> None:
+    angle = np.linspace(0.0, np.pi, 61)
+    corners = 3.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    curve = LineMap(tuple(_line(a, b) for a, b in zip(corners.tolist(), corners[1:].tolist())))
+    whole = whole_lines(curve)
+    # A chord of what is left is never farther from the arc than its pieces may be.
+    assert whole.lengths.max() < 2.0 * np.sqrt(2.0 * 3.0 * 0.2 * WIDTH) + 1e-6
+    assert len(whole) > 15
+
+
+def _pieces(line_map: LineMap, *counts: int, gap: float = 0.0) -> LineMap:
+    """A map with its lines cut in so many pieces each, in turn."""
+    parts = []
+    for line, n in zip(line_map, itertools.cycle(counts)):
+        step, half = (line.end - line.start) / n, 0.5 * gap * line.direction
+        parts.extend(replace(
+            line, start=line.start + k * step + (k > 0) * half,
+            end=line.start + (k + 1) * step - (k + 1 < n) * half) for k in range(n))
+    return LineMap(tuple(parts))
+
+
+def test_pieces_hide_no_symmetry() -> None:
+    rectangle, square = _rectangle(4.0, 3.0), _rectangle(4.0, 4.0)
+    assert len(map_symmetries(_pieces(rectangle, 2, 1, 1, 1))) == 2
+    assert len(map_symmetries(_pieces(square, 3, 1, 2, 1, gap=0.05))) == 4
+    # A gap that images show does.
+    assert len(map_symmetries(_pieces(rectangle, 2, 1, 1, 1, gap=0.5))) == 1
+
+
+@pytest.mark.parametrize('gap', [0.0, 0.05, 0.3, 0.6])
+def test_strips_that_run_over_joints_and_gaps_give_the_pose(gap: float, table: FloorTable) -> None:
+    box = _rectangle(3.8, 2.8)
+    # Because one side is whole no strip is too long to be one line.
+    line_map = _pieces(box, 1, 2, 2, 2, gap=gap)
+    searcher = Searcher(table, line_map, LocaliserOptions())
+    rng = np.random.default_rng(12)
+    for _ in range(8):
+        pose = Pose2(*rng.uniform(-0.7, 0.7, 2), rng.uniform(-np.pi, np.pi))
+        fitted = searcher.candidates(_strips(box, pose, rng)).fitted
+        assert any(_near(c.pose, pose) and c.score > 0.8 for c in fitted)
 
 
 # ---------------------------------------------------------------- strips from blobs

@@ -39,7 +39,8 @@ HERE, THERE, NOWHERE = Pose2(1.0, 0.0, 0.0), Pose2(4.0, 2.0, 1.0), Pose2(-3.0, 2
 
 
 def _alignment(pose: Pose2) -> Any:
-    return SimpleNamespace(pose=pose, support=np.ones(2), explained=0.5, missing=())
+    return SimpleNamespace(
+        pose=pose, support=np.ones(2), whole=np.arange(2), explained=0.5, missing=())
 
 
 def _found(pose: Pose2, score: float, by_strips: float = 0.8) -> Found:
@@ -141,7 +142,7 @@ def test_a_pose_is_beaten_by_what_holds_unless_more_of_it_may_be_there() -> None
     assert not ledger.beats(_strips(THERE, 0.7, misfit=0.5))
     plain = _ledger((), None, ())
     plain.hold(replace(_found(HERE, 0.8), alignment=SimpleNamespace(
-        pose=HERE, support=np.ones(3), explained=1.0, missing=())), None)
+        pose=HERE, support=np.ones(3), whole=np.arange(3), explained=1.0, missing=())), None)
     assert plain.beats(_strips(THERE, 0.6, claimed=0.9))
     assert not plain.beats(_strips(THERE, 0.6, claimed=0.97))
 
@@ -198,7 +199,8 @@ def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_op
         ledger = _ledger((), None, ())
         ledger.hold(_found(HERE, best), None)
         ledger.hide(AWAY, replace(_found(THERE, 0.6), alignment=SimpleNamespace(
-            pose=THERE, support=np.ones(lines), explained=1.0, missing=())))
+            pose=THERE, support=np.ones(lines), whole=np.arange(lines), explained=1.0,
+            missing=())))
         assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])
 
 

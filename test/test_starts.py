@@ -20,14 +20,19 @@ from pathlib import Path
 from typing import Any
 
 from nccs_pose.cli import main
+from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.estimate import Candidate, Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.symmetries import map_symmetries
+from nccs_pose.estimation.verdict import lines_used
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
+from nccs_pose.geometry.floor_table import FloorTable
+from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.renderer import render
-from nccs_pose.simulation.scene import arena_map, arena_scene
+from nccs_pose.simulation.scene import arena_map, arena_scene, ideal_scene
 import numpy as np
 import pytest
 
@@ -50,6 +55,77 @@ def test_in_the_arena_every_image_gives_the_pose() -> None:
     assert (starts.wrong, starts.without) == (0, 0)
     assert len(starts.cost) == len(starts.threshold) == 4
     assert min(starts.cost.min(), starts.threshold.min()) > 0.0
+
+
+def _in_pieces(line_map: LineMap, count: int, gap: float) -> LineMap:
+    """A map with each of its lines cut in so many pieces, with gaps of so many metres."""
+    parts = []
+    for line in line_map:
+        step, half = (line.end - line.start) / count, 0.5 * gap * line.direction
+        parts.extend(replace(
+            line, start=line.start + k * step + (k > 0) * half,
+            end=line.start + (k + 1) * step - (k + 1 < count) * half) for k in range(count))
+    return LineMap(tuple(parts))
+
+
+def _box(*more: tuple[tuple[float, float], tuple[float, float]]) -> LineMap:
+    """A rectangle of tapes that looks the same after half a turn, and other tapes."""
+    corners = [(-2.0, -1.4), (2.0, -1.4), (2.0, 1.4), (-2.0, 1.4)]
+    return LineMap(tuple(
+        Line(np.array([*a, 0.0]), np.array([*b, 0.0]), width=0.05)
+        for a, b in (*zip(corners, corners[1:] + corners[:1]), *more)))
+
+
+MARKED = _box(((0.8, -1.4), (0.8, 1.4)))
+
+
+def _first_estimates(line_map: LineMap, count: int) -> list[tuple[Pose2, Estimate]]:
+    """Poses on a map, and what a first image from each says."""
+    scene = replace(ideal_scene(640, noise=0.02), line_map=line_map)
+    localiser, rng = Localiser(scene.rig, line_map), np.random.default_rng(3)
+    found = []
+    for _ in range(count):
+        pose = Pose2(*rng.uniform(-1.0, 1.0, 2) * (1.0, 0.7), rng.uniform(-np.pi, np.pi))
+        localiser.reset()
+        found.append((pose, localiser.process(0, render(scene, pose, rng))))
+    return found
+
+
+@pytest.mark.parametrize(('count', 'gap'), [(1, 0.0), (2, 0.0), (3, 0.0), (2, 0.05), (3, 0.05)])
+@pytest.mark.parametrize('line_map', [arena_map(), MARKED], ids=['arena', 'marked'])
+def test_a_map_drawn_in_pieces_gives_the_pose_like_a_whole_one(
+    line_map: LineMap, count: int, gap: float,
+) -> None:
+    estimates = _first_estimates(_in_pieces(line_map, count, gap), 8)
+    tracked = [(pose, e.pose) for pose, e in estimates if e.pose is not None]
+    assert len(tracked) >= 7
+    assert all(np.hypot(a.x - b.x, a.y - b.y) < 0.02 for a, b in tracked)
+    assert all(e.pose is not None or e.state is State.AMBIGUOUS for _, e in estimates)
+
+
+@pytest.mark.parametrize(('count', 'gap'), [(1, 0.0), (2, 0.0), (3, 0.0), (2, 0.05), (2, 0.3)])
+def test_a_symmetric_map_drawn_in_pieces_gives_both_poses(count: int, gap: float) -> None:
+    # A side that is cut otherwise than the one across from it is still the same paint.
+    box = _in_pieces(_box(), count, gap)
+    for pose, estimate in _first_estimates(
+            LineMap((*_in_pieces(LineMap(box[:1]), 3, 0.0), *box[1:])), 8):
+        assert estimate.state is State.AMBIGUOUS
+        assert len(estimate.candidates) == 2
+        for twin in (pose, Pose2(0.0, 0.0, np.pi) @ pose):
+            assert any(same_pose(c.pose, twin) for c in estimate.candidates)
+
+
+@pytest.mark.parametrize('gap', [0.0, 0.05])
+def test_a_line_in_pieces_is_one_line_to_rest_on(gap: float) -> None:
+    line_map = _in_pieces(MARKED, 3, gap)
+    scene = replace(ideal_scene(640, noise=0.02), line_map=line_map)
+    pose = Pose2(0.1, -0.2, 0.7)
+    aligner = Aligner(FloorTable(scene.rig, 5.0), line_map, LocaliserOptions())
+    alignment = aligner.align(
+        render(scene, pose, np.random.default_rng(1)), pose, aligner.nominal_colours)
+    assert alignment is not None
+    assert len(alignment.lines) > 10
+    assert lines_used(alignment) == 5
 
 
 def test_among_many_lines_every_image_gives_the_pose() -> None:

@@ -59,6 +59,7 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
+    :ivar whole: the first of the lines that each is one with in an image (L,).
     :ivar offset: by which each group of neighbours lies off its line (G,), px.
     :ivar offset_label: line of each group (G,).
     :ivar colours: the colours as this image shows them.
@@ -76,6 +77,7 @@ class Alignment:
     lines: tuple[int, ...]
     missing: tuple[int, ...]
     support: Array
+    whole: NDArray[np.intp]
     offset: Array
     offset_label: NDArray[np.intp]
     colours: tuple[LineColour, ...]
@@ -117,7 +119,7 @@ class Pass:
     :ivar weighed: what the stations say, by the weights that they have.
     :ivar moved: how far the solve moves the station that it moves farthest, px.
     :ivar leant: how far height, roll and pitch alone move each (N,), px.
-    :ivar lines: so many are in the map.
+    :ivar whole: of each line of the map, the first of those that it is one with (L,).
     """
 
     weighed: WeighedShifts
@@ -128,7 +130,7 @@ class Pass:
     moved: float
     leant: Array
     colours: tuple[LineColour, ...]
-    lines: int
+    whole: NDArray[np.intp]
 
     @cached_property
     def alignment(self) -> Alignment:
@@ -144,7 +146,7 @@ class Pass:
 def _alignment_of(measured: Pass) -> Alignment:
     """What a last pass comes to."""
     bands, fit, refinement = measured.bands, measured.fit, measured.refinement
-    lines = measured.lines
+    lines = len(measured.whole)
     inlier, = refinement.inlier.nonzero()
     index = measured.used.take(inlier)
     # A tape half a pixel wide shows half the contrast, and is missed half as badly.
@@ -163,8 +165,8 @@ def _alignment_of(measured: Pass) -> Alignment:
         refinement.pose, refinement.covariance, refinement,
         LinePoints(pixels, scale * sigma, label), residual, scale, sigma,
         float(explained), tuple(there.nonzero()[0].tolist()), _missing(bands, index, label),
-        there / np.where(seen > 0, seen, np.nan), offset, label.take(first), measured.colours,
-        bands)
+        there / np.where(seen > 0, seen, np.nan), measured.whole, offset, label.take(first),
+        measured.colours, bands)
 
 
 def _missing(

@@ -88,8 +88,16 @@ class Associator:
     lines, and of the map lines in view that strips lie on.
     """
 
-    def __init__(self, line_map: LineMap, table: FloorTable) -> None:
+    def __init__(
+        self, line_map: LineMap, table: FloorTable, joined: LineMap | None = None,
+    ) -> None:
+        """Prepare.
+
+        :param joined: the map with those of its lines joined that a strip may run along together;
+            itself if None.
+        """
         lines = FloorLines(line_map)
+        self._joined = lines if joined is None or joined is line_map else FloorLines(joined)
         self._place = Place(lines, NearestLines(lines), FloorScale(table))
         self._likenesses = _likenesses(line_map, self._place)
         self._last: StripScorer | None = None
@@ -108,7 +116,7 @@ class Associator:
         if len(segments) < 2:
             return Candidates((), _NONE)
         scorer = self._scorer(segments)
-        poses = Poses(*poses_of_pairs(scorer.strips, self._place.lines, _PAIRS))
+        poses = Poses(*poses_of_pairs(scorer.strips, self._joined, _PAIRS))
         if len(poses.place) == 0:
             return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []

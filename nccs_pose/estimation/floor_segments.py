@@ -52,9 +52,9 @@ _ALIKE = 0.8
 _LEAST_LENGTH = 0.2
 # Pieces further apart than this are not joined, metres.
 _LONGEST_GAP = 0.8
-# So much longer than the longest tape they are several in a row, this far apart, metres.
+# So much longer than the longest tape they are several in a row, further apart than this, metres.
 _TOO_LONG = 1.1
-_ROW_GAP = 0.12
+ROW_GAP = 0.12
 # Where something is this close beside a strip, metres, it does not stand free. If more than this
 # part of what lies in the strip is there, the strip is part of a larger thing, unless it stands
 # free for so long as a line has to be.
@@ -167,6 +167,15 @@ def floor_segments(
         starts -= fewer[1]
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
+
+
+def widest_gap(longest: float, ends: float) -> float:
+    """Widest gap in a row of tapes that strips run over, with so much of them beyond it, metres.
+
+    :param longest: length of the longest of the tapes, metres.
+    :param ends: how much of a strip is on either side, metres.
+    """
+    return max(ROW_GAP, min(_LONGEST_GAP, _TOO_LONG * longest - 2.0 * ends))
 
 
 def _candidates(
@@ -297,7 +306,7 @@ def _one_tape(
     """Of a strip that is longer than any tape the heaviest part between two gaps."""
     if math.isinf(longest) or np.ptp(along[inside]) <= _TOO_LONG * longest:
         return inside
-    return _longest_run(points, along, inside, _ROW_GAP)
+    return _longest_run(points, along, inside, ROW_GAP)
 
 
 def _longest_run(

@@ -24,6 +24,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.shift_solve import weigh_shifts, WeighedShifts
+from nccs_pose.estimation.whole_lines import first_pieces
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -97,7 +98,7 @@ class Measurer:
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
         self.predictor = BandPredictor(table, line_map)
-        self._lines = len(line_map)
+        self._whole = first_pieces(line_map)
         self._options = options
         names = tuple(dict.fromkeys(line.colour for line in line_map))
         self._colour_of_line = np.array([names.index(line.colour) for line in line_map])
@@ -211,7 +212,7 @@ class Measurer:
         leant = (refinement.attitude - look.attitude).dot(by_attitude)
         moved = look.beside(refinement.pose, refinement.attitude)
         return Pass(weighed, refinement, look.bands, fit, used, float(np.abs(moved).max()), leant,
-                    colours, self._lines)
+                    colours, self._whole)
 
     def _weigh(
         self, shift: Array, sigma: Array, slide: Array, index: NDArray[np.intp], bands: Bands,

@@ -22,9 +22,11 @@ import math
 
 from nccs_pose.estimation.association import Associator, Candidates, FittedCandidate
 from nccs_pose.estimation.floor_points import PixelFloor
-from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment
+from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment, widest_gap
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.estimation.strip_pairs import BEYOND
 from nccs_pose.estimation.told import Told
+from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
@@ -70,13 +72,17 @@ class Searcher:
     """
 
     def __init__(self, table: FloorTable, line_map: LineMap, options: LocaliserOptions) -> None:
-        self._associator = Associator(line_map, table)
+        # Strips run on over the joints of lines that the map draws in pieces.
+        line_map = whole_lines(line_map)
         self._options = options
         self._widths: dict[str, float] = {}
         for line in line_map:
             self._widths[line.colour] = max(line.width, self._widths.get(line.colour, 0.0))
         # Where no tapes stand in a row, pieces in a row are one tape.
         self._longest = float(line_map.lengths.max()) if _in_a_row(line_map) else math.inf
+        # They run on over gaps too, while they are no longer than some tape is.
+        self._associator = Associator(
+            line_map, table, whole_lines(line_map, widest_gap(self._longest, BEYOND)))
         # The paper's threshold is one of whole pixels.
         by_hsv, pitch = options.threshold == 'hsv', 1
         while not by_hsv and table.rig.camera.width >= 2 * pitch * _WIDTH:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from nccs_pose.estimation.many_poses import SAME_YAW
+from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2, wrap_angle
 import numpy as np
@@ -29,8 +30,9 @@ def map_symmetries(line_map: LineMap) -> tuple[Pose2, ...]:
     """Every motion S of the map that lays its tapes on tapes of the same length and colour.
 
     From S @ T_map_base the map looks as it does from T_map_base. The identity comes first; a map
-    without symmetry has nothing else.
+    without symmetry has nothing else. Where tapes are drawn in pieces makes no difference.
     """
+    line_map = whole_lines(line_map)
     ends = np.stack([line_map.starts[:, :2], line_map.ends[:, :2]], axis=1)
     colours = np.array([line.colour for line in line_map])
     alike = colours[:, None] == colours

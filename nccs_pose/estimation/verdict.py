@@ -62,9 +62,11 @@ class Objection:
 
 
 def lines_used(alignment: Alignment) -> int:
-    """How many lines a pose rests on."""
+    """How many lines a pose rests on; one that the map draws in pieces is one."""
     # A line out of view has no support: NaN is not as large as anything.
-    return sum(part >= _RESTS for part in alignment.support.tolist())
+    return len({
+        whole for whole, part in zip(alignment.whole.tolist(), alignment.support.tolist())
+        if part >= _RESTS})
 
 
 def objection(
