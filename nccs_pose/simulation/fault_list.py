@@ -220,6 +220,21 @@ def _clock_jump(seconds: int, events: Iterator[tuple[bool, Event]]) -> Iterator[
         yield event
 
 
+def _wheels_begun_anew(events: Iterator[tuple[bool, Event]]) -> Iterator[Event]:
+    """Silence the wheels for 0.3 s, after which they count from zero."""
+    silent_ns, origin = None, None
+    for begun, event in events:
+        sample = event.sample
+        if begun and not isinstance(sample, ImageSample):
+            silent_ns = sample.stamp_ns if silent_ns is None else silent_ns
+            if sample.stamp_ns - silent_ns < 300_000_000:
+                continue
+            origin = sample.pose if origin is None else origin
+            sample = dataclasses.replace(sample, pose=origin.inverse() @ sample.pose)
+            event = dataclasses.replace(event, sample=sample)
+        yield event
+
+
 def _occluders() -> tuple[Fault, ...]:
     words = ('one line', 'two lines', 'three lines', 'all four lines')
     return tuple(
@@ -241,6 +256,8 @@ FAULTS: tuple[Fault, ...] = (
           events=functools.partial(_clock_jump, -100)),
     Fault('clock_ahead', 'the clock jumps ahead 1000 s', 0,
           events=functools.partial(_clock_jump, 1000)),
+    Fault('wheels_anew', 'the wheels fall silent and count from zero, in the dark',
+          pixels=_level(0), events=_wheels_begun_anew),
     Fault('defocus', 'out of focus, 2 px at 640', pixels=_defocused),
     Fault('motion_blur', '80 ms shutter', scene=_shaken),
     Fault('noise', 'Gaussian noise of 10 % of full scale', pixels=_noisy),
