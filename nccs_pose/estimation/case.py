@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from nccs_pose.estimation.aligner import LINEAR_PX
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.ledger import Refused, Sifted
+from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.told import Told
@@ -77,7 +78,7 @@ class Case:
     """A look at an image, and what else is known when poses are judged by it.
 
     :ivar sight: what the look shows.
-    :ivar doubts: lines that were seen beside their place and not in it since.
+    :ivar history: what images have said of the lines before.
     :ivar prediction: of the pose, if there is one.
     :ivar told: where the robot is by something else than the image, which can decide between
         equal poses: those that are there come first. Without it two equal poses are enough to
@@ -86,7 +87,7 @@ class Case:
     """
 
     sight: Sight
-    doubts: Set[int]
+    history: LineHistory
     prediction: Prediction | None
     told: Told | None
     before: Mapping[Sight, Sifted]

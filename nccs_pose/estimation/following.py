@@ -16,12 +16,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
-
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.elsewhere import Elsewhere
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
+from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
@@ -53,12 +52,12 @@ class Follower:
 
     def follow(
         self, image: NDArray[np.uint8], prediction: Prediction, colours: tuple[LineColour, ...],
-        doubts: Set[int], watch: Stopwatch,
+        history: LineHistory, watch: Stopwatch,
     ) -> Found | Refused:
         """Lay a predicted pose on an image; refused where the whole must be searched.
 
         :param image: (H, W, 3) uint8 BGR.
-        :param doubts: lines that were seen beside their place and not in it since.
+        :param history: what images have said of the lines before.
         """
         prior = (prediction.pose, prediction.information)
         refused = Refused()
@@ -69,7 +68,7 @@ class Follower:
             if alignment is None or not is_expected(
                     alignment, prediction, self._options.innovation_gate):
                 continue
-            against = self._judge.objection(image, alignment, doubts, expected=True)
+            against = self._judge.objection(image, alignment, history, expected=True)
             if against is None:
                 break
             refused = Refused(against, alignment)

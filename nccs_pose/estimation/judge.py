@@ -16,13 +16,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Set
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.line_history import BEYOND_DOUBT, LineHistory, WEAK
 from nccs_pose.estimation.misplaced import placement, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import COINCIDENT
@@ -43,13 +44,8 @@ from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
 
-# A line of which an expected pose rests on less than this part is looked for beside its place.
-_WEAK = 0.5
-# Its stations stand so close then, px.
+# Stations of a line that is looked for beside its place stand so close, px.
 _CLOSE = 4.0
-# What was once seen beside its place is believed to be so until it is seen in it; or the pose
-# rests on so many other lines that one of them would show.
-_BEYOND_DOUBT = 4
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
 # what is seen, one on three lines that of either; more lines speak for themselves. Where one
 # is missing, fewer strips than this are no evidence: they lie on lines at any pose made of them.
@@ -103,23 +99,23 @@ class Judge:
         self._options = options
 
     def objection(
-        self, image: NDArray[np.uint8], alignment: Alignment, doubts: Set[int], *,
+        self, image: NDArray[np.uint8], alignment: Alignment, history: LineHistory, *,
         expected: bool,
     ) -> Objection | None:
         """What an image says against a pose that was laid on it; None if nothing.
 
-        :param doubts: lines that were seen beside their place and not in it since.
+        :param history: what images have said of the lines before.
         :param expected: whether a prediction agrees with the pose.
         """
         found = objection(alignment, self._map, self._options, expected=expected)
         # Out of nothing every line in view is looked at, else those that leave a question.
-        least = _WEAK if expected else np.inf
+        least = WEAK if expected else np.inf
         support = alignment.support.tolist()
         asked = {*(k for k, part in enumerate(support) if part < least),
-                 *(k for k in doubts if support[k] >= 0.0)}
+                 *(k for k in history.doubted if support[k] >= 0.0)}
         if found is not None or not asked:
             return found
-        asked -= plainly_in_place(alignment)
+        asked -= plainly_in_place(alignment) | history.unasked(alignment)
         if not asked:
             return None
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
@@ -136,14 +132,14 @@ class Judge:
             if seen.beside is not None:
                 return Objection(
                     f'line {name} is seen {seen.beside:.1f} px beside its place', line=k)
-            others = lines_used(alignment) - (alignment.support[k] >= _WEAK)
-            if k in doubts and not seen.confirmed and others < _BEYOND_DOUBT:
+            others = lines_used(alignment) - (alignment.support[k] >= WEAK)
+            if k in history.doubted and not seen.confirmed and others < BEYOND_DOUBT:
                 return Objection(f'line {name} was seen beside its place, and not in it since')
         return None
 
     def found(
         self, image: NDArray[np.uint8], alignment: Alignment,
-        segments: tuple[FloorSegment, ...], doubts: Set[int], *, expected: bool,
+        segments: tuple[FloorSegment, ...], history: LineHistory, *, expected: bool,
         strips: FittedCandidate | None = None,
     ) -> Found | Objection:
         """Judge a pose by the whole image.
@@ -153,7 +149,7 @@ class Judge:
         # What no lines hold in its place tells nothing of where other lines are.
         if leaves_open(alignment.refinement):
             return _UNFIXED
-        return self.objection(image, alignment, doubts, expected=expected) or self.by_strips(
+        return self.objection(image, alignment, history, expected=expected) or self.by_strips(
             alignment, segments, expected=expected, strips=strips)
 
     def may_miss(self, alignment: Alignment, against: Objection) -> bool:
@@ -184,7 +180,7 @@ class Judge:
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
             return _unexplained(used)
-        broad = (alignment.support > _WEAK) & (alignment.width >= _BROAD)
+        broad = (alignment.support > WEAK) & (alignment.width >= _BROAD)
         if not expected and np.count_nonzero(broad) < 2:
             return Objection(
                 f'all but {np.count_nonzero(broad)} of the lines that it rests on are thinner '
@@ -246,18 +242,3 @@ def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float
         gate = min(gate, _WEAK_GATE)
     return close(
         alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
-
-
-def lines_shown(alignment: Alignment) -> frozenset[int]:
-    """The lines that a pose shows in their places, most of each."""
-    return frozenset(k for k, part in enumerate(alignment.support.tolist()) if part >= _WEAK)
-
-
-def settled_doubts(doubts: Iterable[int], alignment: Alignment) -> frozenset[int]:
-    """The doubts that are left after a pose that holds: of lines that it does not show.
-
-    Another place, another doubt: a line out of view (NaN) is no longer doubted.
-    """
-    if lines_used(alignment) > _BEYOND_DOUBT:
-        return frozenset()
-    return frozenset(k for k in doubts if alignment.support[k] < _WEAK)

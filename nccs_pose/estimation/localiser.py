@@ -43,8 +43,9 @@ from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.given_pose import GivenPose
 from nccs_pose.estimation.hypotheses import ambiguity, LEAST_IMAGES, OpenPoses
-from nccs_pose.estimation.judge import Found, Judge, lines_shown, settled_doubts
+from nccs_pose.estimation.judge import Found, Judge
 from nccs_pose.estimation.ledger import Refused, Sifted
+from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import carried_on, PAST, Prediction, Track
 from nccs_pose.estimation.observability import Unobserved, unobserved_directions
@@ -153,9 +154,7 @@ class Localiser:
         self._open = OpenPoses()
         # Since when images have shown nothing where it was expected.
         self._refuted_ns: int | None = None
-        self._doubts: frozenset[int] = frozenset()
-        # Lines that the poses since the last search rest on.
-        self._shown: frozenset[int] = frozenset()
+        self._history = LineHistory()
 
     def _fresh_colours(self) -> tuple[LineColour, ...]:
         """The colours before any image of this place, as blurred as the last image was."""
@@ -218,7 +217,7 @@ class Localiser:
         watch.lap('predict')
         if prediction is None:
             return self._search(stamp_ns, image, None, Refused(), watch)
-        followed = self._follower.follow(image, prediction, self._colours, self._doubts, watch)
+        followed = self._follower.follow(image, prediction, self._colours, self._history, watch)
         if isinstance(followed, Found):
             return self._tracking(
                 stamp_ns, followed, prediction, watch, 'the pose explains the image')
@@ -239,7 +238,7 @@ class Localiser:
             # Another try of the same would come to the same.
             if sight not in looks:
                 looks[sight] = self._sifter.sift(
-                    Case(sight, self._doubts, prediction, told, looks), hypotheses)
+                    Case(sight, self._history, prediction, told, looks), hypotheses)
             sifted = looks[sight]
             watch.lap('measure')
             # What was tried early is no place to be alone in.
@@ -290,7 +289,7 @@ class Localiser:
         watch: Stopwatch,
     ) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""
-        followed = self._follower.follow(image, given, self._colours, self._doubts, watch)
+        followed = self._follower.follow(image, given, self._colours, self._history, watch)
         if not isinstance(followed, Found):
             return None
         _, claimed = self._searcher.score(followed.alignment.pose, segments)
@@ -338,9 +337,7 @@ class Localiser:
         if held is not None:
             self._follower.begin()
         self._open = OpenPoses()
-        self._doubts = settled_doubts(self._doubts, alignment)
-        shown = lines_shown(alignment)
-        self._shown = shown if prior is None else self._shown | shown
+        self._history = self._history.after(alignment, searched=prior is None)
         self._ever_tracked = True
         ranked = held or [found]
         quality = _quality(
@@ -380,12 +377,10 @@ class Localiser:
         """Coast on odometry where that still says something; else say what is missing."""
         against, doubted, track = refused.objection, None, self._track
         missing = against.words if against is not None else what_is_missing(segments)
-        # A line beside its place for the second time, or one that no pose has rested on, speaks
-        # against the poses before as well.
         contradicted = False
         if against is not None and against.line is not None:
-            contradicted = against.line in self._doubts or against.line not in self._shown
-            self._doubts |= {against.line}
+            contradicted = self._history.contradicts(against.line)
+            self._history = self._history.doubting(against.line)
         if refused.alignment is not None:
             doubted = Doubted(refused.alignment.pose, refused.alignment.points)
         if prediction is not None:

@@ -53,9 +53,8 @@ _PLAIN_WIDTH = 1.0
 _PLAIN_SHARE = 0.8
 # One that should be as wide as this, px, is found in its place if it is there.
 _FOUND_WIDTH = 0.7
-# What is thinner than this, px, is outshone by what surrounds it: compression drowns it, and what
-# is left of the floor's own streaks looks like it.
-_LEAST_WIDTH = 0.4
+# What is thinner than this, px, is outshone by what surrounds it.
+_LEAST_WIDTH = 0.31
 # Beside its place a line is when it is off by this, px, and by so many standard deviations; and by
 # more than what surrounds a tape shifts it.
 _BESIDE = 0.5

@@ -149,7 +149,7 @@ class Sifter:
                 return verdict
             expected = self._expected(case, alignment)
             found = self._unless_doubtful(case, ledger, self._judge.found(
-                sight.image, alignment, sight.segments, case.doubts, expected=expected,
+                sight.image, alignment, sight.segments, case.history, expected=expected,
                 strips=start.kept(alignment.pose)), expected)
             verdict = alignment, found
             if isinstance(found, Found) or not self._judge.may_miss(alignment, found):
