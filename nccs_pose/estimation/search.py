@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import permutations
 import math
 
 from nccs_pose.estimation.association import Associator, Candidates, FittedCandidate
@@ -201,13 +200,15 @@ class Searcher:
 
 def _in_a_row(line_map: LineMap) -> bool:
     """Whether one line of a map goes on, after a gap, as another."""
-    for a, b in permutations(line_map, 2):
-        if float(np.linalg.norm(np.cross(a.direction, b.direction))) > _STRAIGHT:
-            continue
-        for end, outward in ((a.start, -a.direction), (a.end, a.direction)):
-            for other in (b.start, b.end):
-                gap = float((other - end) @ outward)
-                aside = float(np.linalg.norm(other - end - gap * outward))
-                if 0.0 < gap < _APART and aside < _STRAIGHT * _APART:
-                    return True
+    x, y = line_map.directions[:, :2].T
+    straight = np.abs(x[:, None] * y - y[:, None] * x) <= _STRAIGHT
+    np.fill_diagonal(straight, False)
+    ends = np.stack([line_map.starts[:, :2], line_map.ends[:, :2]])
+    for begin, outward in zip(ends, (-1.0, 1.0)):
+        # From an end of each line to both ends of each other (2, L, L).
+        dx, dy = np.moveaxis(ends[:, None] - begin[:, None], -1, 0)
+        gap = outward * (dx * x[:, None] + dy * y[:, None])
+        aside = np.abs(dy * x[:, None] - dx * y[:, None])
+        if ((gap > 0.0) & (gap < _APART) & (aside < _STRAIGHT * _APART) & straight).any():
+            return True
     return False
