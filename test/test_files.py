@@ -224,6 +224,13 @@ def test_text_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert (tmp_path / 'new' / 'a.txt').read_bytes() == b'two\n'
     assert [path.name for path in (tmp_path / 'new').iterdir()] == ['a.txt']
     write_text('/dev/null', 'gone')  # must stay a device
+    for leads_to in (tmp_path / 'new' / 'a.txt', tmp_path / 'new' / 'none yet.txt'):
+        link = tmp_path / f'to {leads_to.name}'
+        link.symlink_to(leads_to)
+        check_writable(link)
+        write_text(link, 'through\n')
+        assert link.is_symlink()
+        assert leads_to.read_text() == 'through\n'
     assert not Path('/dev/null').is_file()
     with pytest.raises(FileError, match=r'b\.txt.*cannot be written'):
         write_text(tmp_path / 'new' / 'a.txt' / 'b.txt', 'x')

@@ -502,6 +502,21 @@ def test_a_line_much_longer_than_the_reach_is_seen_as_a_shorter_one(reach: float
         np.testing.assert_allclose(long, short, atol=8)
 
 
+def test_the_next_piece_of_a_line_is_no_tape_beside_it() -> None:
+    """Far off, where a few pixels of floor are decimetres, it cost half of the stations."""
+    table, pose = FloorTable(SCENE.rig, 5.0), Pose2(0.0, -1.5, 0.3)
+
+    def stations(*cuts: float) -> int:
+        ends = (-2.0, *cuts, 2.0)
+        drawn = LineMap(tuple(_line((a, 1.5), (b, 1.5)) for a, b in itertools.pairwise(ends)))
+        predictor = BandPredictor(table, drawn)
+        bands, _ = predictor.bands(predictor.places(pose, SPACING, 75), pose)
+        return len(bands)
+
+    # Its ends are ends all the same.
+    assert stations(-0.7, 0.7) > 0.6 * stations()
+
+
 @pytest.mark.parametrize('reach', [2.0, 5.0])
 def test_no_image_is_read_for_a_pose_that_would_rest_on_too_little(
         reach: float, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,6 +74,22 @@ def test_odometry_is_carried_on_a_little_past_its_last_sample() -> None:
     assert odometry.at(round(2.3 * SECOND)) is None
 
 
+@pytest.mark.parametrize('apart_ns', [10_000, 100_000, 1_000_000])
+def test_samples_that_are_stamped_in_bursts_are_carried_on_as_fast_as_the_wheels_roll(
+        apart_ns: int) -> None:
+    """Each burst of three tells of 60 ms of even motion, under stamps at its end."""
+    twist, odometry = Twist(0.3, 0.4), Odometry(clock_jump=1.0)
+    for burst in range(20):
+        for k in range(3):
+            rolled = integrate_twist(START, twist, 0.02 * (3 * burst + k))
+            odometry.add(burst * 60_000_000 + (k - 2) * apart_ns, rolled)
+    at = odometry.at(19 * 60_000_000 + 40_000_000)
+    assert at is not None
+    moved, turned = _difference(at.pose, integrate_twist(START, twist, 0.02 * 59 + 0.04))
+    assert moved < 0.02
+    assert turned < 0.03
+
+
 def test_odometry_says_nothing_of_what_it_does_not_cover() -> None:
     odometry = Odometry(clock_jump=1.0)
     assert odometry.at(0) is None
@@ -277,11 +293,15 @@ def test_a_velocity_that_changes_steadily_goes_on_to_change() -> None:
     for acceleration in (np.array([0.8, 0.0, 0.0]), np.array([0.0, 0.0, -1.5])):
         poses = [Pose2(*(np.array([0.3, 0.0, 0.4]) * (acceleration != 0.0) * t
                          + 0.5 * acceleration * t**2)) for t in stamps]
-        tracks = [_track(round(t * SECOND), pose, 1e-6 * np.eye(3))
-                  for t, pose in zip(stamps, poses)]
-        prediction = by_velocity(tracks[:3], tracks[3], tracks[4].stamp_ns)
-        assert prediction is not None
-        assert _difference(prediction.pose, poses[4]) == pytest.approx((0.0, 0.0), abs=1e-9)
+        # As long as the poses are known so well that their errors are not taken for a change.
+        for sigma, goes_on in ((1e-4, True), (2e-2, False)):
+            tracks = [_track(round(t * SECOND), pose, sigma**2 * np.eye(3))
+                      for t, pose in zip(stamps, poses)]
+            prediction = by_velocity(tracks[:3], tracks[3], tracks[4].stamp_ns)
+            even = by_velocity(tracks[2:3], tracks[3], tracks[4].stamp_ns)
+            assert prediction is not None and even is not None
+            assert _difference(prediction.pose, poses[4] if goes_on else even.pose) == (
+                pytest.approx((0.0, 0.0), abs=1e-9))
 
 
 @pytest.mark.parametrize('way', [

@@ -43,6 +43,8 @@ _ACCELERATION = (1.0, 2.0)
 # A prediction less sure than this, m and rad, leaves room for more than one place that looks the
 # same: of cells of half a metre it may be halfway to the next after 2.5 deviations.
 _SURE = (0.1, 0.2)
+# A change of velocity goes on if it is larger than so many deviations of what is known of it.
+_CERTAIN = 2.0
 # So many poses before the last one show how the velocity changes.
 PAST = 3
 
@@ -181,9 +183,11 @@ def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction
     velocities = [_step(a.pose, b.pose) / time for (a, b), time in zip(pairwise(tracks), seconds)]
     velocity = velocities[-1]
     if len(velocities) == PAST:
-        velocity = velocity + 0.5 * (before + dt) * _going_on(*(
+        change = _going_on(*(
             2.0 * (v - u) / (s + t)
             for (u, v), (s, t) in zip(pairwise(velocities), pairwise(seconds))))
+        known = np.abs(change) > _CERTAIN * _sigma_of_change(tracks[-3:], seconds[-2:])
+        velocity = velocity + 0.5 * (before + dt) * np.where(known, change, 0.0)
     moved = last.pose @ Pose2(*(dt * velocity).tolist())
     sigma, sigma_yaw = (0.5 * a * blind * (blind + before) for a in _ACCELERATION)
     return Prediction(
@@ -194,6 +198,19 @@ def _step(before: Pose2, after: Pose2) -> Array:
     """The motion (x, y, yaw) from one pose to another, seen from the first (3,)."""
     step = before.inverse() @ after
     return np.array([step.x, step.y, step.yaw])
+
+
+def _sigma_of_change(tracks: Sequence[Track], seconds: Sequence[float]) -> Array:
+    """What the errors of three poses make of the change of velocity (3,), one sigma.
+
+    :param seconds: between them.
+    """
+    s, t = seconds
+    a, b, c = (track.covariance.diagonal() for track in tracks)
+    variance = a / s**2 + b * (1.0 / s + 1.0 / t) ** 2 + c / t**2
+    # The change is seen from the robot, which may look anywhere.
+    variance = np.array([variance[0] + variance[1]] * 2 + [variance[2]])
+    return 2.0 / (s + t) * np.sqrt(variance)
 
 
 def _going_on(first: Array, second: Array) -> Array:

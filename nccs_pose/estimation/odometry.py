@@ -139,17 +139,21 @@ class Odometry:
         """How much further a sample goes than wheels do after the last, metres and rad."""
         last_ns, last = self._stamps[-1], self._poses[-1]
         seconds = 1e-9 * (stamp_ns - last_ns)
-        begin = max(bisect_right(self._stamps, last_ns - _WINDOW_NS) - 1, 0)
+        begin = self._begin_of_window()
         window = 1e-9 * (last_ns - self._stamps[begin])
         rolled = self._poses[begin].inverse() @ last
         share = seconds / window
         went_on = last @ Pose2(share * rolled.x, share * rolled.y, share * rolled.yaw)
         heard = min(seconds, 1e-9 * _LONGEST_GAP_NS)
         way, turn = (
-            max(min(stopped, on) - 0.5 * faster * heard * (heard + window) - uneven, 0.0)
-            for stopped, on, faster, uneven in zip(
-                _apart(last, pose), _apart(went_on, pose), _SPEEDING_UP, _UNEVEN))
+            further if further > 0.5 * faster * heard * (heard + window) + uneven else 0.0
+            for further, faster, uneven in zip(
+                map(min, _apart(last, pose), _apart(went_on, pose)), _SPEEDING_UP, _UNEVEN))
         return way, turn
+
+    def _begin_of_window(self) -> int:
+        """The sample from which on it is seen how fast the wheels roll at the last one."""
+        return max(bisect_right(self._stamps, self._stamps[-1] - _WINDOW_NS) - 1, 0)
 
     @property
     def last_ns(self) -> int | None:
@@ -169,7 +173,8 @@ class Odometry:
         if n < 2 or stamp_ns < self._stamps[0] - 1:
             return None
         right = min(max(bisect_right(self._stamps, stamp_ns), 1), n - 1)
-        left = right - 1
+        # Past the last sample it goes on as over a while: the last two may be of one moment.
+        left = right - 1 if stamp_ns <= self._stamps[-1] else self._begin_of_window()
         t0, t1 = self._stamps[left], self._stamps[right]
         since, until = stamp_ns - t0, t1 - stamp_ns
         if -until > _LONGEST_GAP_NS or t1 - t0 > 4 * _LONGEST_GAP_NS:

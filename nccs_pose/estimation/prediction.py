@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import itertools
 import math
 
+from nccs_pose.estimation.whole_lines import first_pieces
 from nccs_pose.geometry.floor_table import as_complex, as_points, Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -94,7 +95,7 @@ class BandPredictor:
             self._half_width, 0.5 * self._half_width**2, self._length, parts / self._length,
             parts.cumsum() - parts, -self._direction.imag, self._direction.real])
         self._slope = _SLOPE * np.arange(_COARSE * len(self._lines))
-        self._gap = self._gaps(parts)
+        self._gap = self._gaps(parts, first_pieces(line_map)[self._lines])
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
@@ -221,10 +222,11 @@ class BandPredictor:
         last = np.clip(to_foot.real + half_chord, 0.0, self._length)
         return first[:, None] + np.linspace(0.0, 1.0, _COARSE) * (last - first)[:, None]
 
-    def _gaps(self, parts: NDArray[np.intp]) -> Array:
+    def _gaps(self, parts: NDArray[np.intp], whole: NDArray[np.intp]) -> Array:
         """Floor between a tape's edge and the next tape, metres, along one tape after the other.
 
         :param parts: of each tape (L,).
+        :param whole: the line that each is a piece of (L,): its other pieces are no next tape.
         """
         tape = np.arange(len(parts)).repeat(parts)
         part = np.arange(len(tape)) - (parts.cumsum() - parts).repeat(parts)
@@ -236,7 +238,7 @@ class BandPredictor:
             seen = (points - self._start[k]) * self._direction[k].conj()
             beyond = seen.real - np.clip(seen.real, 0.0, self._length[k])
             gap = np.hypot(beyond, seen.imag) - half_width
-            gap[tape == k] = np.inf
+            gap[whole.take(tape) == whole[k]] = np.inf
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width.take(tape)
 

@@ -15,12 +15,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 from nccs_pose.errors import FileError
+from nccs_pose.files.text_files import write_bytes
 from nccs_pose.vision.decode import Image
 
 if TYPE_CHECKING:
@@ -53,10 +53,4 @@ def save_image(image: Image, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in ('.png', '.jpg', '.jpeg'):
         raise FileError(f'{path}: images are written as .png or .jpg.')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f'.{path.name}.{os.getpid()}.part')
-        temporary.write_bytes(cv2.imencode(path.suffix, image)[1].tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
+    write_bytes(path, cv2.imencode(path.suffix, image)[1].tobytes())

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+import errno
 import os
 from pathlib import Path
 import stat
@@ -61,29 +62,36 @@ def read_text(path: str | Path, most: int = LARGEST) -> str:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` (UTF-8, newlines as they are), replacing the file in one step.
+    """Write `text` (UTF-8, newlines as they are) as :func:`write_bytes` does.
 
-    A reader, or a run that is interrupted, never sees half of it. Missing folders are made. What
-    UTF-8 cannot say, as of a file's name in another encoding, is written as an escape.
+    What UTF-8 cannot say, as of a file's name in another encoding, is written as an escape.
+
+    :raises FileError: the file cannot be written; names it and the reason.
+    """
+    write_bytes(path, text.encode('utf-8', 'backslashreplace'))
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a whole file, replacing what was there in one step.
+
+    A reader, or a run that is interrupted, never sees half of it. Missing folders are made. A link
+    stays one: what it leads to is replaced.
 
     :raises FileError: the file cannot be written; names it and the reason.
     """
     path = Path(path)
-    temporary = _temporary(path)
+    target = Path(os.path.realpath(path))
+    temporary = _temporary(target)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not path.is_file():  # a pipe, /dev/null: never to be replaced
-            temporary = path
-        with open(
-                temporary, 'w', encoding='utf-8', errors='backslashreplace', newline='',
-                opener=_without_waiting) as file:
-            file.write(text)
-        if temporary != path:
-            os.replace(temporary, path)
+        _make_folder(target)
+        in_place = _is_no_file(path)
+        with open(path if in_place else temporary, 'wb', opener=_without_waiting) as file:
+            file.write(content)
+        if not in_place:
+            os.replace(temporary, target)
     except OSError as error:
-        if temporary != path:
-            with suppress(OSError):
-                temporary.unlink()
+        with suppress(OSError):
+            temporary.unlink()
         raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
 
 
@@ -96,12 +104,13 @@ def check_writable(path: str | Path) -> None:
     try:
         if path.is_dir():
             raise FileError(f'{path}: cannot be written: it is a folder.')
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not path.is_file():
+        target = Path(os.path.realpath(path))
+        _make_folder(target)
+        if _is_no_file(path):
             if not os.access(path, os.W_OK):
                 raise FileError(f'{path}: cannot be written: Permission denied.')
             return
-        temporary = _temporary(path)
+        temporary = _temporary(target)
         temporary.touch()
         temporary.unlink()
     except OSError as error:
@@ -113,6 +122,23 @@ def _without_waiting(path: str, flags: int) -> int:
     descriptor = os.open(path, flags | os.O_NONBLOCK, 0o666)
     os.set_blocking(descriptor, True)
     return descriptor
+
+
+def _is_no_file(path: Path) -> bool:
+    """Whether a path leads to a pipe or a device, as /dev/stdout does: never to be replaced."""
+    return path.exists() and (
+        not path.is_file() or os.path.realpath(path.parent).startswith(('/dev', '/proc')))
+
+
+def _make_folder(path: Path) -> None:
+    """Make the folder of a file, if there is none.
+
+    :raises OSError: if it cannot be made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR)) from error
 
 
 def _temporary(path: Path) -> Path:

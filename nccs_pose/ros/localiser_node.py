@@ -222,12 +222,12 @@ class LocaliserNode(LifecycleNode):
             self.get_logger().warning(
                 f'the stamps jumped back by {back:.3f} s: the tracker starts anew')
         self._estimate = estimate
-        if self._outputs.publish(
-                estimate, frame_id, image, not self._withheld(), self._localiser.options):
+        if not self._withheld() and self._outputs.publish(estimate):
             self._tally.answered += 1
             self._pose_stamp_ns = stamp_ns
             self._keeper.remember(estimate)
         self._latency_s = time.monotonic() - self._stream.arrived
+        self._outputs.draw(estimate, frame_id, image, self._localiser.options)
         self._watch.look(estimate)
         if self._shown != self._summary():
             self._report_diagnostics()

@@ -63,29 +63,32 @@ class Outputs:
             for kind, endpoint in (
                 (PoseWithCovarianceStamped, POSE), (Image, DEBUG_IMAGE), (MarkerArray, MARKERS)))
 
-    def publish(
-        self, estimate: Estimate, frame_id: str, image: NDArray[np.uint8], trusted: bool,
+    def publish(self, estimate: Estimate) -> bool:
+        """Publish the pose and the transform of an estimate.
+
+        :returns: whether it has a pose.
+        """
+        if estimate.pose is None or estimate.covariance is None:
+            return False
+        self._pose.publish(pose_message(
+            estimate.stamp_ns, self._frame, estimate.pose, estimate.covariance))
+        self.transforms.broadcast(estimate.stamp_ns, estimate.pose)
+        return True
+
+    def draw(
+        self, estimate: Estimate, frame_id: str, image: NDArray[np.uint8],
         estimator: LocaliserOptions,
-    ) -> bool:
-        """Publish an estimate; what nobody subscribes is not computed.
+    ) -> None:
+        """Publish what is to be looked at; what nobody subscribes is not computed.
 
         :param frame_id: of the image.
-        :param trusted: false withholds pose and transform.
-        :param estimator: the options it was made with.
-        :returns: whether a pose was published.
+        :param estimator: the options that the estimate was made with.
         """
-        given = False
-        if trusted and estimate.pose is not None and estimate.covariance is not None:
-            self._pose.publish(pose_message(
-                estimate.stamp_ns, self._frame, estimate.pose, estimate.covariance))
-            self.transforms.broadcast(estimate.stamp_ns, estimate.pose)
-            given = True
         if self._debug.get_subscription_count():
             drawn = draw_debug_image(image, self._rig, self._map, estimate, estimator)
             self._debug.publish(image_message(estimate.stamp_ns, frame_id, drawn))
         if self._markers.get_subscription_count():
             self._markers.publish(marker_array(self._frame, estimate, self._rig, self._map))
-        return given
 
     def others(self) -> str:
         """Who else publishes the pose, in words; empty if nobody does."""
@@ -94,7 +97,7 @@ class Outputs:
         if number <= 0:
             return ''
         return (f'{topic} has {number} other publisher{"s" if number > 1 else ""}: its '
-                'subscribers get poses of both. Is the node started twice?')
+                'subscribers get the poses of all that are active. Is the node started twice?')
 
     def close(self) -> None:
         """Destroy the publishers."""

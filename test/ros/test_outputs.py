@@ -82,14 +82,14 @@ def test_nothing_is_drawn_while_nobody_subscribes(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(outputs_module, 'draw_debug_image', never)
     monkeypatch.setattr(outputs_module, 'marker_array', never)
     outputs, publishers = made()
-    assert outputs.publish(TRACKING, 'camera', IMAGE, True, LocaliserOptions())
+    outputs.draw(TRACKING, 'camera', IMAGE, LocaliserOptions())
+    assert outputs.publish(TRACKING)
     assert len(publishers['pose'].messages) == 1
 
 
-def test_no_pose_leaves_when_there_is_none_or_it_is_not_trusted():
+def test_no_pose_leaves_when_there_is_none():
     outputs, publishers = made()
-    assert not outputs.publish(LOST, 'camera', IMAGE, True, LocaliserOptions())
-    assert not outputs.publish(TRACKING, 'camera', IMAGE, False, LocaliserOptions())
+    assert not outputs.publish(LOST)
     assert publishers['pose'].messages == []
 
 
@@ -100,7 +100,7 @@ def test_debug_image_shows_the_mask_and_leaves_the_image_alone():
     image = IMAGE.copy()
     image[150:156, 40:280] = (40, 170, 40)  # a green strip
     before = image.copy()
-    outputs.publish(LOST, 'camera', image, True, LocaliserOptions())
+    outputs.draw(LOST, 'camera', image, LocaliserOptions())
     np.testing.assert_array_equal(image, before)
     (message,) = debug.messages
     assert (message.header.frame_id, message.header.stamp.nanosec) == ('camera', 8)
