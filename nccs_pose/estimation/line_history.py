@@ -69,13 +69,17 @@ class LineHistory:
         doubted = frozenset(k for k in self.doubted if alignment.support[k] < WEAK)
         if lines_used(alignment) > BEYOND_DOUBT:
             doubted = frozenset()
-        plain = frozenset(
-            k for k in plainly_in_place(alignment) if alignment.width[k] >= _SURE_WIDTH)
-        if len({int(alignment.whole[k]) for k in plain}) < BEYOND_DOUBT:
-            plain = frozenset()
-        return LineHistory(
-            doubted, shown if searched else self.shown | shown, self.proven | plain)
+        # Most images show no line that is not proven yet.
+        proven = self.proven if shown <= self.proven else self.proven | _proven(alignment)
+        return LineHistory(doubted, shown if searched else self.shown | shown, proven)
 
     def unasked(self, alignment: Alignment) -> frozenset[int]:
         """Lines of which an image can say nothing new: proven ones that it shows too thin."""
         return frozenset(k for k in self.proven if alignment.width[k] < _SURE_WIDTH)
+
+
+def _proven(alignment: Alignment) -> frozenset[int]:
+    """Lines that one image proves; none where it shows too few in their places."""
+    width = alignment.width
+    plain = frozenset(k for k in plainly_in_place(alignment) if width[k] >= _SURE_WIDTH)
+    return plain if len({int(alignment.whole[k]) for k in plain}) >= BEYOND_DOUBT else frozenset()
