@@ -38,8 +38,8 @@ _FASTEST = (10.0, 20.0)
 _LONGEST_ROLL = 1.0
 _LEAP = (0.1, 0.2)
 # They stop at once, or go on about as fast as over the last so many ns: but for what wheels speed
-# up by, m/s^2 and rad/s^2, and for this, m and rad. A sample that goes further may be another start
-# of odometry too; all the more after a silence, in which they may have done anything.
+# up by, m/s^2 and rad/s^2, and for this, m and rad. A sample that goes further may be another
+# start of odometry too; all the more after a silence, in which they may have done anything.
 _WINDOW_NS = 50_000_000
 _SPEEDING_UP = (3.0, 6.0)
 _UNEVEN = (0.05, 0.05)
