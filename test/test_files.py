@@ -232,6 +232,11 @@ def test_text_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         assert link.is_symlink()
         assert leads_to.read_text() == 'through\n'
     assert not Path('/dev/null').is_file()
+    # What a process has open, as /dev/stdout may lead to, stays the file that it has open.
+    with (tmp_path / 'open').open('w+') as file:
+        (tmp_path / 'standard output').symlink_to(f'/proc/self/fd/{file.fileno()}')
+        write_text(tmp_path / 'standard output', 'into it\n')
+        assert file.read() == 'into it\n'
     with pytest.raises(FileError, match=r'b\.txt.*cannot be written'):
         write_text(tmp_path / 'new' / 'a.txt' / 'b.txt', 'x')
 
@@ -253,6 +258,7 @@ def test_only_regular_files_of_some_size_are_read(
 
 def test_what_cannot_be_written_is_said_before_and_after(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'circle').symlink_to(tmp_path / 'circle')
 
     def write(path: Path) -> None:
         write_text(path, 'text')
@@ -260,7 +266,8 @@ def test_what_cannot_be_written_is_said_before_and_after(tmp_path: Path) -> None
     for path, words in (
             (tmp_path / ('x' * 250), 'File name too long'),
             (tmp_path / ('x' * 300) / 'a', 'File name too long'),
-            (Path('/proc/nowhere/a'), 'cannot be written: No such file')):
+            (Path('/proc/nowhere/a'), 'cannot be written: No such file'),
+            (tmp_path / 'circle' / 'a', 'cannot be written')):
         assert words in refusal(check_writable, path)
         assert words in refusal(write, path)
     assert 'folder' in refusal(check_writable, tmp_path)
@@ -268,7 +275,7 @@ def test_what_cannot_be_written_is_said_before_and_after(tmp_path: Path) -> None
     assert 'cannot be written' in refusal(write, tmp_path / 'pipe')
     check_writable('/dev/null')
     check_writable(tmp_path / 'fine')
-    assert [path.name for path in tmp_path.iterdir()] == ['pipe']
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['circle', 'pipe']
 
 
 def test_a_name_in_another_encoding_is_written_as_an_escape(tmp_path: Path) -> None:

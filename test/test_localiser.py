@@ -557,7 +557,8 @@ def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatc
         image, start, aligner.nominal_colours, reach=5.0,
         laid=drive.pose @ Pose2(0.3, 0.0, 0.0)) is None
     # Nor would any line that should be seen there.
-    judge = Judge(Searcher(table, RAILS, options), table, RAILS, options)
+    judge = Judge(
+        Searcher(table, RAILS, options), aligner.predictor, table, RAILS, options)
     against = judge.found(image, alignment, (), frozenset(), expected=False)
     assert isinstance(against, Objection) and not judge.may_miss(alignment, against)
     seen = replace(alignment, support=np.array([1.0, 1.0, 0.0, np.nan]))

@@ -23,7 +23,7 @@ from functools import lru_cache
 from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.prediction import Places
+from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -88,6 +88,11 @@ class Aligner:
         self._places = lru_cache(1)(self._places_for)
         self._chosen = lru_cache(_REMEMBERED)(self._choose)
         self._options = options
+
+    @property
+    def predictor(self) -> BandPredictor:
+        """What tells where the map's tapes are seen."""
+        return self._measurer.predictor
 
     @property
     def nominal_colours(self) -> tuple[LineColour, ...]:

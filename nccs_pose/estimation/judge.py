@@ -90,9 +90,10 @@ class Judge:
     """Judges poses laid on images of one rig and map."""
 
     def __init__(
-        self, searcher: Searcher, table: FloorTable, line_map: LineMap, options: LocaliserOptions,
+        self, searcher: Searcher, predictor: BandPredictor, table: FloorTable, line_map: LineMap,
+        options: LocaliserOptions,
     ) -> None:
-        self._predictor = BandPredictor(table, line_map)
+        self._predictor = predictor
         self._searcher = searcher
         self._table = table
         self._map = line_map

@@ -122,7 +122,8 @@ class Localiser:
         aligner = Aligner(self._table, self._map, options)
         self._nominal_colours = aligner.nominal_colours
         self._searcher = Searcher(self._table, self._map, options)
-        self._judge = Judge(self._searcher, self._table, self._map, options)
+        self._judge = Judge(
+            self._searcher, aligner.predictor, self._table, self._map, options)
         self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
         rivals = Rivals(aligner, self._searcher, self._judge, self._symmetries, options)
         self._sifter = Sifter(aligner, self._judge, rivals, self._symmetries, options)

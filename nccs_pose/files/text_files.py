@@ -23,6 +23,8 @@ import stat
 
 from nccs_pose.errors import FileError
 
+# Linux follows no more; links that lead round in a circle would never end.
+_MOST_LINKS = 40
 LARGEST = 2**28
 """Bytes of a file that is read whole: a day of poses, hundreds of megapixels."""
 
@@ -125,9 +127,19 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def _is_no_file(path: Path) -> bool:
-    """Whether a path leads to a pipe or a device, as /dev/stdout does: never to be replaced."""
-    return path.exists() and (
-        not path.is_file() or os.path.realpath(path.parent).startswith(('/dev', '/proc')))
+    """Whether a path leads to what is never to be replaced.
+
+    That is a pipe or a device, or a file that a process has open, as /dev/stdout may lead to.
+    """
+    if path.exists() and not path.is_file():
+        return True
+    for _ in range(_MOST_LINKS):
+        if not path.is_symlink():
+            break
+        path = path.parent / os.readlink(path)
+        if path.parts[:2] == ('/', 'proc'):
+            return True
+    return False
 
 
 def _make_folder(path: Path) -> None:
