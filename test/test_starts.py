@@ -79,9 +79,11 @@ def _box(*more: tuple[tuple[float, float], tuple[float, float]]) -> LineMap:
 MARKED = _box(((0.8, -1.4), (0.8, 1.4)))
 
 
-def _first_estimates(line_map: LineMap, count: int) -> list[tuple[Pose2, Estimate]]:
-    """Poses on a map, and what a first image from each says."""
-    scene = replace(ideal_scene(640, noise=0.02), line_map=line_map)
+def _first_estimates(
+    line_map: LineMap, count: int, width: int = 640,
+) -> list[tuple[Pose2, Estimate]]:
+    """Poses on a map, and what a first image from each says, so many px wide."""
+    scene = replace(ideal_scene(width, noise=0.02), line_map=line_map)
     localiser, rng = Localiser(scene.rig, line_map), np.random.default_rng(3)
     found = []
     for _ in range(count):
@@ -113,6 +115,13 @@ def test_a_symmetric_map_drawn_in_pieces_gives_both_poses(count: int, gap: float
         assert len(estimate.candidates) == 2
         for twin in (pose, Pose2(0.0, 0.0, np.pi) @ pose):
             assert any(same_pose(c.pose, twin) for c in estimate.candidates)
+
+
+def test_pieces_of_a_line_are_not_two_lines_wide_enough() -> None:
+    drawn = arena_map(), _in_pieces(arena_map(), 2, 0.0)
+    whole, cut = ([e.state for _, e in _first_estimates(m, 12, 320)] for m in drawn)
+    assert State.SEARCHING in whole
+    assert cut == whole
 
 
 @pytest.mark.parametrize('gap', [0.0, 0.05])

@@ -181,10 +181,11 @@ class Judge:
         least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
         if not expected and least < _MOST:
             return _unexplained(used)
-        broad = (alignment.support > WEAK) & (alignment.width >= _BROAD)
-        if not expected and np.count_nonzero(broad) < 2:
+        broad = set(alignment.whole[
+            (alignment.support > WEAK) & (alignment.width >= _BROAD)].tolist())
+        if not expected and len(broad) < 2:
             return Objection(
-                f'all but {np.count_nonzero(broad)} of the lines that it rests on are thinner '
+                f'all but {len(broad)} of the lines that it rests on are thinner '
                 f'than {_BROAD} px', hidden=True)
         return found
 
