@@ -91,7 +91,7 @@ def left_open(
     carried_on = (best, *others[:most])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-    more = [Candidate(h.pose, h.mean) for h in others[most:]]
+    more = [h.candidate for h in others[most:]]
     more += [Candidate(c.pose, before * c.score) for c in (*sifted.open[most:], *sifted.rest)]
     if len(sifted.others.place) > 0:
         # They show no more than the least of what was looked at closely, for all that is known.

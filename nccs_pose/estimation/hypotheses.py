@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import SPEED
 from nccs_pose.estimation.odometry import Wheels
@@ -51,6 +52,11 @@ class Hypothesis:
     def mean(self) -> float:
         """Mean score."""
         return sum(self.scores) / len(self.scores)
+
+    @property
+    def candidate(self) -> Candidate:
+        """What is said of it to others."""
+        return Candidate(self.pose, self.mean)
 
 
 @dataclass(frozen=True, eq=False)

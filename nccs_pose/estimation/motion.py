@@ -119,19 +119,6 @@ class Prediction:
 FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])
 
 
-def carried_on(
-    past: Sequence[Track], last: Track, now: Wheels | None, stamp_ns: int,
-) -> Prediction | None:
-    """Carry a pose on to a stamp by the wheels, or where they are silent by its velocity.
-
-    :param past: the poses before the last one, in order.
-    :param now: what the wheels say at the stamp; None without odometry.
-    """
-    if last.odometry is not None and now is not None:
-        return by_odometry(last.pose, last.covariance, last.odometry, now, last.seen_way)
-    return by_velocity(past, last, stamp_ns)
-
-
 def by_odometry(
     pose: Pose2, covariance: Array, before: Wheels, after: Wheels,
     seen_way: float | None = None,
