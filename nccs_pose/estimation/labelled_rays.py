@@ -94,11 +94,6 @@ class LabelledRays:
         return self.lines[:, :3]
 
     @property
-    def moments(self) -> Array:
-        """Moments of the lines about the origin (L, 3), metres."""
-        return self.lines[:, 3:]
-
-    @property
     def rows(self) -> Array:
         """Coefficients of S (7, N), metres."""
         return self._forms[:, 0]
