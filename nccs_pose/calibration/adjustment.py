@@ -41,6 +41,7 @@ _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
 _CHANCE = 1e-3  # probability with which noise as told widens the claims
 _SOUND = 5.0  # robust residual in units of the noise as told, beyond which nothing fits yet
 _FEET = 2  # how often the feet of the perpendiculars are dropped
+_MOST_STEPS = 60
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
 # A pose is somewhere within 100 m and 10 rad: keeps every block regular, moves nothing.
 _VAGUE = np.diag([1e-4, 1e-4, 1e-2])
@@ -153,7 +154,7 @@ class Adjustment:
 
 def adjust(
     parameters: RigParameters, observations: Observations, poses: Array, *,
-    theta: Array | None = None, max_iterations: int = 60,
+    theta: Array | None = None,
 ) -> Adjustment:
     """Refine the rig and the poses together.
 
@@ -168,7 +169,7 @@ def adjust(
     theta = np.zeros(len(parameters)) if theta is None else np.array(theta, dtype=float)
     everything = np.ones(len(observations), dtype=bool)
     theta, poses, terms, ended, used = _descend(
-        problem, theta, np.array(poses, dtype=float), everything, True, max_iterations)
+        problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
     scale = _robust_scale(terms)
     inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
     if inlier.sum() < 3 * observations.frames + len(parameters):
@@ -180,7 +181,7 @@ def adjust(
         if scale <= _SOUND:
             problem.drop_feet(theta, poses)
         theta, poses, terms, finished, more = _descend(
-            problem, theta, poses, inlier, False, max_iterations)
+            problem, theta, poses, inlier, cauchy=False)
         used += more
     e = terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
@@ -212,13 +213,12 @@ def _robust_scale(terms: Linearisation) -> float:
 
 
 def _descend(
-    problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], cauchy: bool,
-    max_iterations: int,
+    problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], *, cauchy: bool,
 ) -> tuple[Array, Array, Linearisation, bool, int]:
     """Levenberg-Marquardt; returns where it ends, whether it converged, and the steps taken."""
     spread, damping = problem.parameters.spread, 0.0
     terms = problem.linearise(theta, poses)
-    for iteration in range(max_iterations):
+    for iteration in range(_MOST_STEPS):
         width = _CAUCHY * _robust_scale(terms) if cauchy else np.inf
         weight = chosen / (1.0 + (terms.residual / width) ** 2)
         system = ArrowSystem.of(terms, weight, problem.slices)
@@ -240,7 +240,7 @@ def _descend(
             return theta, poses, terms, True, iteration + 1
         if damping > 1e8:
             return theta, poses, terms, False, iteration + 1
-    return theta, poses, terms, False, max_iterations
+    return theta, poses, terms, False, _MOST_STEPS
 
 
 def _squared_size(system: ArrowSystem, step: Array, pose_step: Array, spread: Array) -> float:

@@ -47,6 +47,7 @@ SEARCHING = 'searching'
 STAGES = tuple(field.name for field in fields(StageTimes))
 LEAST_FRAMES = 4
 _RATE = 10.0
+_SEED = 4
 _GREEN = ((40, 50, 40), (90, 255, 255))
 
 
@@ -81,7 +82,7 @@ def threshold_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def measure_stages(
-    width: int, frames: int, *, seed: int = 4,
+    width: int, frames: int, *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StageCosts:
     """Time tracking and searching on the same drive.
@@ -93,9 +94,9 @@ def measure_stages(
     if frames < LEAST_FRAMES:
         raise OptionError(f'frames = {frames}: quartiles need at least {LEAST_FRAMES}')
     scene, track = arena_scene(width), figure_of_eight()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     wheels = measure_odometry(
-        track, frames / _RATE, WheelModel(rate=_RATE), np.random.default_rng([seed, 1]), 0)
+        track, frames / _RATE, WheelModel(rate=_RATE), np.random.default_rng([_SEED, 1]), 0)
     images = []
     for k in range(frames):
         images.append(render(scene, track.pose(k / _RATE), rng))
