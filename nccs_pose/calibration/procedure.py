@@ -100,7 +100,8 @@ def calibrate(
     given = None if poses is None else np.asarray(poses, dtype=float)[usable]
 
     first = _start(parameters, thin, given)
-    theta, all_poses, agree = _pose_all(parameters, thin, first)
+    theta = first.adjustment.theta
+    all_poses, agree = _pose_all(thin, first)
     judges = np.zeros(len(thin), dtype=bool)
     judges[options.held_out - 1::options.held_out] = True
     pool = np.flatnonzero(agree & ~judges)
@@ -187,17 +188,17 @@ def _start(
 
 
 def _pose_all(
-    parameters: RigParameters, frames: list[FrameObservation], first: Start,
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Pose every frame under the refined rig.
+    frames: list[FrameObservation], first: Start,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Pose every frame under the first refined rig.
 
-    :returns: theta (P,), poses (F, 3), and which frames agree with the rig (F,).
+    :returns: poses (F, 3), and which frames agree with the rig (F,).
     """
-    theta, model = first.adjustment.theta, first.adjustment.model
+    model = first.adjustment.model
     poses, _ = first_poses(model.rig, model.line_map, frames, rough=False)
     judged = judge(model, model, frames, poses)
     limit = 3.0 * max(1.0, first.adjustment.scale)
-    return theta, judged.poses, judged.after_whitened <= limit
+    return judged.poses, judged.after_whitened <= limit
 
 
 def _demand_frames(usable: int, frames: int, least: int) -> None:

@@ -189,17 +189,7 @@ class BandPredictor:
                 & (np.minimum(distance, length - distance) > half * np.abs(lean)))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
                       places.spacing, self._lines.take(number), places.members)
-        # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
-        # along its line does not count.
-        slide = np.empty((6, len(number)))
-        against = -gain
-        np.multiply(against, left, out=slide[:2])
-        np.multiply(against, (back * middle).real, out=slide[2])
-        # Floor that sinks by dz is seen where the ray would have met it, further out.
-        sinking = against * (back * image.falls).imag
-        slide[3] = sinking
-        np.multiply(sinking, middle.imag, out=slide[4])
-        np.multiply(-sinking, middle.real, out=slide[5])
+        slide = _slide(gain, left, middle, back, image.falls)
         if np.count_nonzero(keep) == len(keep):
             return bands, slide.T
         # The groups of each line are made whole again.
@@ -241,6 +231,30 @@ class BandPredictor:
             gap[whole.take(tape) == whole[k]] = np.inf
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width.take(tape)
+
+
+def _slide(gain: Array, left: Array, middle: Complex, back: Complex, falls: Complex) -> Array:
+    """d(place of stations across their curves)/d(x, y, yaw, z, roll, pitch), (6, N).
+
+    A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it along its
+    line does not count.
+
+    :param gain: px across the curve by metres across the line (N,).
+    :param left: direction across the line in the map, to its left (2, N).
+    :param middle: the stations in base_link, x + iy (N,), metres.
+    :param back: the line's direction in base_link, conjugate (N,).
+    :param falls: how far out floor is seen that has sunk, per metre of that (N,).
+    """
+    slide = np.empty((6, len(gain)))
+    against = -gain
+    np.multiply(against, left, out=slide[:2])
+    np.multiply(against, (back * middle).real, out=slide[2])
+    # Floor that sinks by dz is seen where the ray would have met it, further out.
+    sinking = against * (back * falls).imag
+    slide[3] = sinking
+    np.multiply(sinking, middle.imag, out=slide[4])
+    np.multiply(-sinking, middle.real, out=slide[5])
+    return slide
 
 
 def _turned_back(pose: Pose2) -> complex:
