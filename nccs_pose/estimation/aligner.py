@@ -34,47 +34,48 @@ from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 SPACING = 2.0
-# To follow a robot they are chosen for poses so far apart, m and rad: one in between sees those of
-# the nearest about as evenly spaced, and a robot has moved so little in most images that no others
-# are needed. So many choices are remembered, as it may stand where two meet.
+# To follow a robot, stations are chosen for poses on a lattice of this spacing, m and rad: from
+# anywhere near one of these they look about as evenly spaced, and most images need no new choice.
+# So many choices are remembered, as a robot may stand where several meet.
 _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
-# Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
-# first, rough pass takes one station of so many. On more curve than this, px, these few show what
-# tapes look like as well, and a second pass takes some too.
+# Where the image is sharp, so that a tape is found from nearby only, or the start is a little off,
+# a first, rough pass takes one station in four. Where more curve than this is in view, px, these
+# few show what tapes look like as well, and a second pass takes one in two.
 _SOME = (4, 2)
 _LONG = 2000.0
-# What a first pass moves a start by more than this, px, that should be off by less than that, is
-# nowhere near.
+# A start that should be off by LINEAR_PX at most, but is moved by more than this, px, in its first
+# pass is nowhere near.
 _ASTRAY_PX = 5.0
-# A search that ends this near a pose, m and rad, is refined to it.
+# Poses this close, m and rad, are refined to the same one.
 _SAME = (0.01, 0.005)
 _ITERATIONS = 8
-# The poses have settled when the last step moved no station by more than this share of the blur
-# (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
-# half a standard deviation), or when it was below half a standard deviation.
+# A pose has settled when its last step moved no station by more than this share of the blur, or
+# was below half a standard deviation. (Profiles miss a hundredth or two of a larger shift, all of
+# them alike: three times this share cost half a standard deviation.)
 _SETTLED_BLURS = 0.1
 _SETTLED = 0.5
-# Of a robot that is followed one pass is enough if it misses no more of its step than so many
-# standard deviations: this part of it and, times the square of the blurs that it moves a station
-# by, that part.
+# To follow a robot one pass is enough if it misses less of its step than so many standard
+# deviations. It misses the part MISSED, and MISSED_BEYOND times the square of the blurs that it
+# moves a station by.
 _FOLLOWED = 0.2
 _MISSED = 0.01
 _MISSED_BEYOND = 0.05
-# Nor does a pass count that has just learned a blur so different, px: a template too soft or too
-# sharp takes a step for larger or smaller than it is.
+# No pose has settled in a pass that learned a blur so different, px, from the one it went by: a
+# template too soft or too sharp takes a step for larger or smaller than it is.
 _LEARNED_BLUR = 0.1
 # Up to a step so large, px, what stations slide by is proportional to it: they are measured again
 # without a look at the image.
 _SLIDING_PX = 1.0
 # After a step larger than this the stations are chosen anew, px.
 _MOVED_PX = 3.0
-# What still steps at the end, by less than this (m and rad), is uncertain by that much more.
+# A pose that still moves in the last pass is given if it does by less than this, m and rad; it is
+# uncertain by that step besides.
 _LAST_STEP = 0.005
-# A pose rests on so much of curve, px.
+# A pose has to rest on so much curve, px.
 _LEAST_LENGTH = 192.0
-# Of a searched pose this part of what must be found at the end has to be found from the first.
-_HOPELESS = 0.8
+# From its first pass on, a pose that is searched has to show this part of what it must in the end.
+_AT_FIRST = 0.8
 # A pass that moves no station further than this, px, shows the lines that the last will.
 _NEARLY = 1.0
 
@@ -133,11 +134,11 @@ class Aligner:
             are searched first; 0 is for a start that is most likely right.
         :param prior: a pose with its information (3, 3): carries the directions that the lines in
             view do not fix.
-        :param hopeless: whether a pose that will not move any further is refused in any case: one
-            that is comes back as it is, before it has settled; so does one of which a direction
-            is left open.
-        :param laid: what the start was laid to by what is near its place. No search is followed
-            that leads there, or to the start again, or that leaves a direction of the pose open.
+        :param hopeless: says of a pose that has nearly settled whether it is refused in any case.
+            If so it is given as it is, which saves the last passes; so is one of which the lines
+            leave a direction open.
+        :param laid: the pose that the same start came to with a smaller reach. A search is not
+            followed if it leads there, or back to the start, or leaves a direction open.
         :returns: None where too little of what the start predicts is found, where a search leads
             to nothing new, or where the poses do not settle.
         """
@@ -172,7 +173,7 @@ class Aligner:
             if measured is None or measured.length < _LEAST_LENGTH:
                 return None
             if not followed and (measured.alignment.explained
-                                 < _HOPELESS * self._options.least_explained):
+                                 < _AT_FIRST * self._options.least_explained):
                 return None
             pose, covariance = measured.refinement.pose, measured.refinement.covariance
             steady = _is_steady(state.colours, measured.colours)
@@ -227,7 +228,7 @@ class Aligner:
     ) -> Pose2 | None:
         """Where a search across the bands leads; None where to nothing, or to nothing new."""
         # About as much is in view from where it leads.
-        if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
+        if self._places(start).length < _AT_FIRST * _LEAST_LENGTH:
             return None
         searched = self._measurer.search(image, start, prior, colours, reach)
         if searched is None or (laid is not None and (

@@ -82,7 +82,8 @@ def left_open(
     :returns: those to be laid on the next image, and others that may be right as well.
     """
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
-    # What is left open shows so much of what the best does, in the images before as well.
+    # Scores of what is left open are of this image, as parts of its best; those of hypotheses are
+    # means over several.
     before = best.mean / held[0].score
     most = _CARRIED - 1
     others = sorted(

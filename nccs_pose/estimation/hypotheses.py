@@ -40,8 +40,8 @@ class Hypothesis:
 
     :ivar pose: T_map_base at the last image that was looked at.
     :ivar scores: its score in each image that it explained, 0 to 1.
-    :ivar apart: how far the robot may be from there by now, for all that wheels say of it, metres
-        and rad.
+    :ivar apart: how far the robot may be from there by now, metres and rad: by what the wheels
+        leapt since or, without wheels, by what it may have driven.
     """
 
     pose: Pose2
@@ -61,7 +61,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class OpenPoses:
-    """The hypotheses that the last image which showed any left.
+    """The hypotheses that are left open, as of the last image that showed any of them.
 
     :ivar hypotheses: the best first; none where there is nothing to decide.
     :ivar stamp_ns: of that image.
@@ -77,7 +77,7 @@ class OpenPoses:
         return bool(self.hypotheses)
 
     def at(self, stamp_ns: int, odometry: Wheels | None) -> tuple[Hypothesis, ...]:
-        """Where they are at another image; without wheels somewhere near.
+        """Where they are by another image; without wheels still there, or somewhere near.
 
         :param odometry: what the wheels say then.
         """
