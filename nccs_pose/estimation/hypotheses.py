@@ -95,13 +95,11 @@ class OpenPoses:
 def confronted(
     hypotheses: Sequence[Hypothesis], held: Sequence[tuple[Pose2, float]],
 ) -> tuple[Hypothesis, ...]:
-    """The hypotheses after an image, best first: those that it shows, in their new place.
+    """The hypotheses after an image, best first: the poses that it shows, each with its scores.
 
-    :param held: every pose that explains the image, with its score; without any the image
-        decides nothing.
+    :param hypotheses: those before it, in their new place.
+    :param held: every pose that explains the image, with its score.
     """
-    if not held:
-        return tuple(hypotheses)
     found = []
     for pose, score in held:
         before = max(

@@ -48,13 +48,13 @@ def render(
     return expose(_irradiance(scene, pose, twist), scene.sensor, rng)
 
 
-def expected_image(scene: Scene, pose: Pose2) -> np.ndarray:
-    """Give the picture of a robot at rest, before noise, rounding, clipping and compression.
+def expected_image(scene: Scene, pose: Pose2, twist: Twist | None = None) -> np.ndarray:
+    """Give the picture before noise, rounding, clipping and compression.
 
     :returns: (H, W, 3) float32, BGR in grey levels (full scale 255); smooth in the pose, for
         Cramér-Rao bounds by finite differences.
     """
-    return respond(_irradiance(scene, pose, None), scene.sensor)
+    return respond(_irradiance(scene, pose, twist), scene.sensor)
 
 
 def _irradiance(scene: Scene, pose: Pose2, twist: Twist | None) -> np.ndarray:
