@@ -69,8 +69,8 @@ _DEFAULTS = LocaliserOptions()
 _REFUTED_NS = 500_000_000
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
-# A pose that was given is believed on too little to find it without only if it explains this part
-# of the strips.
+# Where too little is in view to find a pose, one that was given is believed if it explains this
+# part of the strips.
 _LEAST_CLAIMED = 0.5
 _FOUND = 'found by searching the whole image'
 
@@ -198,7 +198,7 @@ class Localiser:
             given = self._given if self._given is not None and self._given.is_new else None
             self._odometry.clear()
             self.relocalise()
-            # Said since the last image, it is of the time that begins.
+            # One that was given since the last image belongs to the time that begins.
             self._given = given
         watch = Stopwatch()
         wheels = self._odometry.at(stamp_ns)
@@ -282,13 +282,13 @@ class Localiser:
         looks: dict[Sight, Sifted] = {}
         for sight in sights(frame.image, self._searcher, self._fresh_colours(), self._in_vain,
                             told, frame.watch.lap):
-            # Another try of the same would come to the same.
+            # One that comes again would come to the same.
             if sight not in looks:
                 looks[sight] = self._sifter.sift(
                     Case(sight, self._history, frame.prediction, told, looks), hypotheses)
             sifted = looks[sight]
             frame.watch.lap('measure')
-            # What was tried early is no place to be alone in.
+            # On a sight that came early, though it promises little, one pose alone proves nothing.
             if sifted.held and (
                     sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
                 break
