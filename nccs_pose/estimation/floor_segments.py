@@ -107,7 +107,7 @@ class FloorSegment:
 
 def floor_segments(
     segmentation: Segmentation, floor: PixelFloor, width: float, colour: str,
-    longest: float = math.inf,
+    longest: float,
 ) -> tuple[FloorSegment, ...]:
     """At most 16 straight strips among the blobs, those of most pixels first.
 

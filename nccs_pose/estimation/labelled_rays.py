@@ -55,8 +55,8 @@ class LabelledRays:
         directions: ArrayLike,
         moments: ArrayLike,
         label: ArrayLike,
-        sigma: ArrayLike = 1.0,
-        sigma_world: float = 0.0,
+        sigma: ArrayLike,
+        sigma_world: float,
     ) -> None:
         """See :func:`nccs_pose.estimation.global_pose.solve` for parameters and errors."""
         lines = _checked_lines(directions, moments)

@@ -152,7 +152,7 @@ SCENARIOS = (
 
 
 def run_scenario(
-    scenario: Scenario, trials: int, *, seed: int = 3,
+    scenario: Scenario, trials: int, *, seed: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Covered:
     """Play a scenario's trials to one localiser that forgets everything between them."""
@@ -171,7 +171,7 @@ def run_scenario(
 
 
 def play_trial(
-    localiser: Localiser, scenario: Scenario, scene: Scene, k: int, *, seed: int = 3,
+    localiser: Localiser, scenario: Scenario, scene: Scene, k: int, *, seed: int,
 ) -> tuple[Pose2, Estimate]:
     """The true pose and the estimate of a scenario's k-th trial.
 

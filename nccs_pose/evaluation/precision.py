@@ -203,7 +203,7 @@ def _by_sampling(
 
 
 def run_precision(
-    width: int, poses: int, *, noise: float = 0.05, seed: int = 1,
+    width: int, poses: int, *, noise: float, seed: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Precision:
     """Measure all methods on one image of each of some random poses.

@@ -143,8 +143,8 @@ def _mirror(section: Section) -> QuadricMirror:
 
 
 def _camera(section: Section) -> PinholeCamera:
-    width = section.integer('width', 1, _MOST_PIXELS)
-    height = section.integer('height', 1, _MOST_PIXELS)
+    width = section.count('width', _MOST_PIXELS)
+    height = section.count('height', _MOST_PIXELS)
     K = section.numbers('K', (9,), unit='px').reshape(3, 3)
     if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise section.error('K', f'must have focal lengths above 0, not {K[0, 0]} and {K[1, 1]}')

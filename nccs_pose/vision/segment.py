@@ -65,7 +65,7 @@ class Segmentation:
     place: NDArray[np.intp]
     label: NDArray[np.intp]
     weight: Array
-    pitch: int = 1
+    pitch: int
 
 
 def chromatic_mask(
