@@ -109,6 +109,14 @@ def _cross(strips: tuple[FloorSegment, ...]) -> bool:
     return bool((np.abs(sines) > 0.2).any())
 
 
+def _crosses() -> LineMap:
+    """Forty-five crosses, all alike."""
+    places = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
+    return LineMap(tuple(
+        line for x, y in places
+        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+
+
 def _near(a: Pose2, b: Pose2, metres: float = 0.06, radians: float = 0.04) -> bool:
     return (np.hypot(a.x - b.x, a.y - b.y) < metres
             and abs(float(wrap_angle(a.yaw - b.yaw))) < radians)
@@ -235,10 +243,7 @@ def test_the_true_pose_scores_best_and_a_wrong_one_little(table: FloorTable) -> 
 
 
 def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
-    crosses = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
-    line_map = LineMap(tuple(
-        line for x, y in crosses
-        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+    line_map = _crosses()
     pose = Pose2(12.3, 6.4, 0.7)
     strips = _strips(line_map, pose, np.random.default_rng(25))
     candidates = Associator(line_map, table).candidates(strips).fitted
@@ -253,10 +258,7 @@ def test_all_of_many_equal_places_are_told(table: FloorTable) -> None:
 
 
 def test_equal_places_are_told_alike_however_the_strips_lie(table: FloorTable) -> None:
-    crosses = [(3.0 * i, 3.0 * j) for i in range(9) for j in range(5)]
-    line_map = LineMap(tuple(
-        line for x, y in crosses
-        for line in (_line((x - 1.1, y), (x + 0.7, y)), _line((x, y - 0.8), (x, y + 1.2)))))
+    line_map = _crosses()
     pose = Pose2(11.0, 5.0, 2.0)
     strips = _strips(line_map, pose, np.random.default_rng(25), noise=0.06)
     candidates = Associator(line_map, table).candidates(strips).fitted

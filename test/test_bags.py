@@ -28,7 +28,6 @@ from nccs_pose.files.bags import (
     BagWriter,
     StampedImage,
     StampedOdometry,
-    StampedTruth,
 )
 from nccs_pose.files.trajectories import read_tum
 from nccs_pose.geometry.camera import PinholeCamera
@@ -55,20 +54,18 @@ def small_bag(path: Path, compression: str = '') -> Path:
             [3.1, -0.1, 0.7], [-0.03, 0.01, 0.75]))])
         for i in range(3):
             writer.write_odometry(
-                T0 + i * 10**8, Pose2(0.1 * i, 0.0, 0.5), covariance=np.diag([1.0, 2.0, 3.0]),
-                twist=(1.0, 0.2))
+                T0 + i * 10**8, Pose2(0.1 * i, 0.0, 0.5), twist=(1.0, 0.2))
         for i in range(2):
             stamp = T0 + i * 10**8
             writer.write_truth(stamp, Pose2(1.0 + i, 2.0, -3.0))
             writer.write_camera_info(stamp, CAMERA)
-            writer.write_image(
-                stamp, PICTURE, compression=compression, received_ns=stamp + 35_000_000)
+            writer.write_image(stamp, PICTURE, compression=compression)
     return path
 
 
-def refusal(path: Path, topics: BagTopics | None = None, **events: bool) -> str:
+def refusal(path: Path, topics: BagTopics | None = None) -> str:
     with pytest.raises(FileError) as refused, BagReader(path, topics) as reader:
-        list(reader.events(**events))
+        list(reader.events())
     message = str(refused.value)
     assert message.startswith(str(path))
     assert '\n' not in message
@@ -88,7 +85,6 @@ def test_the_room_s_bag_says_what_its_files_say(ray_traced: Path) -> None:
         images = [e for e in reader.events() if isinstance(e, StampedImage)]
         recorded_truth, recorded_odometry = reader.ground_truth(), reader.odometry()
     assert [image.stamp_ns for image in images] == truth.stamps_ns.tolist()
-    assert {image.received_ns - image.stamp_ns for image in images} == {35_000_000}
     assert images[7].decode().shape == (720, 960, 3)
     at = np.searchsorted(recorded_truth.stamps_ns, truth.stamps_ns)
     np.testing.assert_array_equal(recorded_truth.stamps_ns[at], truth.stamps_ns)
@@ -100,32 +96,31 @@ def test_the_room_s_bag_says_what_its_files_say(ray_traced: Path) -> None:
 def test_the_shipped_bag_is_the_room_and_small_enough_to_ship() -> None:
     with BagReader(ROOM) as reader:
         assert reader.image_count() == 60
-        received = [event.received_ns for event in reader.events(ground_truth=True)]
+        # Its images arrived 35 ms after their stamps, what the wheels said at once.
+        received = [event.stamp_ns + 35_000_000 * isinstance(event, StampedImage)
+                    for event in reader.events()]
     assert received == sorted(received)
-    assert len(received) == 60 + 611 + 671
+    assert len(received) == 60 + 611
     assert sum(file.stat().st_size for file in (REPO / 'bags').rglob('*')) < 12e6
 
 
 @pytest.mark.parametrize('compression', ['', 'png', 'jpeg'])
 def test_what_is_written_is_read(tmp_path: Path, compression: str) -> None:
     with BagReader(small_bag(tmp_path / 'bag', compression)) as reader:
-        events = list(reader.events(ground_truth=True))
+        events = list(reader.events())
         camera, truth = reader.camera(), reader.ground_truth()
     images = [event for event in events if isinstance(event, StampedImage)]
-    assert [(i.stamp_ns, i.received_ns, i.frame_id) for i in images] == [
-        (T0 + d, T0 + d + 35_000_000, 'camera_optical') for d in (0, 10**8)]
+    assert [image.stamp_ns for image in images] == [T0, T0 + 10**8]
     error = np.abs(images[1].decode().astype(int) - PICTURE)
     assert error.max() <= (8 if compression == 'jpeg' else 0)
     odometry = [event for event in events if isinstance(event, StampedOdometry)]
     assert [event.stamp_ns for event in odometry] == [T0, T0 + 10**8, T0 + 2 * 10**8]
     np.testing.assert_allclose(odometry[2].pose.as_array(), [0.2, 0.0, 0.5], atol=1e-15)
     assert (odometry[0].frame_id, odometry[0].child_frame_id) == ('odom', 'base_link')
-    truths = [event for event in events if isinstance(event, StampedTruth)]
-    np.testing.assert_allclose(truths[1].pose.as_array(), [2.0, 2.0, -3.0], atol=1e-14)
     np.testing.assert_allclose(truth.poses, [[1.0, 2.0, -3.0], [2.0, 2.0, -3.0]], atol=1e-14)
     assert camera == PinholeCamera(
         64, 48, 50.0, 51.0, 31.5, 23.5, distortion=(0.1, -0.01, 0.001, 0.002, 0.0))
-    assert [event.received_ns for event in events] == sorted(e.received_ns for e in events)
+    assert [event.stamp_ns for event in events] == sorted(e.stamp_ns for e in events)
 
 
 def test_the_messages_are_what_ros_defines(tmp_path: Path) -> None:
@@ -143,9 +138,7 @@ def test_the_messages_are_what_ros_defines(tmp_path: Path) -> None:
     assert info.p.reshape(3, 4)[:, :3].ravel().tolist() == info.k.tolist()
     assert info.d.tolist() == [0.1, -0.01, 0.001, 0.002, 0.0]
     odometry = messages['/odom'][0]
-    covariance = odometry.pose.covariance.reshape(6, 6)
-    assert [covariance[0, 0], covariance[1, 1], covariance[5, 5]] == [1.0, 2.0, 3.0]
-    assert covariance.sum() == 6.0
+    assert not odometry.pose.covariance.any()
     assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (1.0, 0.2)
     transform = messages['/tf_static'][0].transforms[0]
     assert (transform.header.frame_id, transform.child_frame_id) == ('base_link', 'mirror')
@@ -220,7 +213,7 @@ def test_flipped_bytes_never_end_in_a_traceback(tmp_path: Path) -> None:
         (path / 'bag.mcap').write_bytes(damaged)
         try:
             with BagReader(path) as reader:
-                for event in reader.events(ground_truth=True):
+                for event in reader.events():
                     if isinstance(event, StampedImage):
                         event.decode()
         except (FileError, VisionError):
@@ -326,7 +319,7 @@ def test_an_image_that_lies_about_its_size_is_refused_when_decoded(tmp_path: Pat
     path = write_with_rosbags(tmp_path / 'bag', '/image', 'sensor_msgs/msg/Image', image)
     with BagReader(path) as reader:
         (event,) = reader.events()
-    assert (event.stamp_ns, event.received_ns, event.frame_id) == (5_000_000_006, T0, 'lens')
+    assert event.stamp_ns == 5_000_000_006
     with pytest.raises(VisionError, match='100 bytes'):
         event.decode()
 

@@ -530,7 +530,8 @@ def test_progress_moves_on_a_terminal_and_is_silent_when_short(
     monkeypatch.setattr('nccs_pose.cli.progress.time.monotonic', lambda: now[0])
 
     def run(stream: io.StringIO, seconds: float) -> str:
-        with Progress(10, 'frames', stream) as progress:
+        monkeypatch.setattr('sys.stderr', stream)
+        with Progress(10, 'frames') as progress:
             for _ in range(10):
                 now[0] += seconds
                 progress.step('tracking')

@@ -101,19 +101,19 @@ colour: red
 width: 1e-3
 lines:
   - {start: [0, 0], end: [1e0, 2]}
-  - {name: "it's: no", start: [0.1, 0, 0.5], end: [.5, 2, 0.5], width: 5e-2, colour: green}
-  - {start: [0, 0, 0], end: [0, 0, 2], width: 0, name: "null"}
+  - {name: "it's: no", start: [0.1, 0, 0], end: [.5, 2, 0.0], width: 5e-2, colour: green}
+  - {start: [0, 1, 0], end: [0, -1, 0], width: 2, name: "null"}
 """
-    line_map = load_map(map_file(tmp_path, text), tapes=False)
+    line_map = load_map(map_file(tmp_path, text))
     save_map(line_map, tmp_path / 'again.yaml', comment='saved')
-    again = load_map(tmp_path / 'again.yaml', tapes=False)
+    again = load_map(tmp_path / 'again.yaml')
     assert line_map.frame == again.frame == 'arena'
     assert [line.name for line in again] == ['line0', "it's: no", 'null']
     assert [line.colour for line in again] == ['red', 'green', 'red']
     # YAML 1.1 would read 1e-3 as a word
-    np.testing.assert_array_equal(again.widths, [0.001, 0.05, 0.0])
-    np.testing.assert_array_equal(again.starts, [[0.0, 0.0, 0.0], [0.1, 0.0, 0.5], [0, 0, 0]])
-    np.testing.assert_array_equal(again.ends, [[1.0, 2.0, 0.0], [0.5, 2.0, 0.5], [0, 0, 2]])
+    np.testing.assert_array_equal(again.widths, [0.001, 0.05, 2.0])
+    np.testing.assert_array_equal(again.starts, [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0, 1, 0]])
+    np.testing.assert_array_equal(again.ends, [[1.0, 2.0, 0.0], [0.5, 2.0, 0.0], [0, -1, 0]])
 
 
 @pytest.mark.parametrize(('old', 'new', 'words'), [

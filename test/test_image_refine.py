@@ -24,7 +24,7 @@ from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.trials import Cell, DataSet, make_data_set
 from nccs_pose.geometry.line_trace import trace_line
 from nccs_pose.geometry.lines import Line
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 import pytest
@@ -52,8 +52,7 @@ def distances(rig: Rig, data: DataSet, pose: Pose2) -> np.ndarray:
 
 
 def nees(data: DataSet, pose: Pose2, bound: np.ndarray) -> float:
-    error = pose.as_array() - data.truth.as_array()
-    error[2] = wrap_angle(error[2])
+    error = pose.minus(data.truth)
     return float(error @ np.linalg.solve(bound, error))
 
 

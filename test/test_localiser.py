@@ -105,9 +105,7 @@ class Drive:
     def error(self, estimate: Estimate) -> np.ndarray:
         """(x, y, yaw) of the estimate less the truth."""
         assert estimate.pose is not None
-        error = estimate.pose.as_array() - self.pose.as_array()
-        error[2] = wrap_angle(error[2])
-        return error
+        return estimate.pose.minus(self.pose)
 
     def right(self, estimate: Estimate) -> bool:
         error = self.error(estimate)
@@ -1116,9 +1114,8 @@ def test_a_tape_that_compression_drowns_is_not_seen_beside_the_place_where_it_on
 
 
 def _tilted(scene: Scene, roll: float, pitch: float) -> Scene:
-    rig = scene.rig
     tilt = RigidTransform.from_rpy(np.array([roll, pitch, 0.0]), np.zeros(3))
-    return replace(scene, rig=replace(rig, T_base_mirror=tilt @ rig.T_base_mirror))
+    return scene.mounted(tilt @ scene.rig.T_base_mirror)
 
 
 @pytest.mark.parametrize(('quality', 'state'), [(95, State.TRACKING), (30, State.SEARCHING)])
@@ -1158,7 +1155,7 @@ def test_roll_and_pitch_are_estimated_where_the_floor_is_not_flat() -> None:
             options = LocaliserOptions(tilt_sigma=sigma, largest_misfit=20.0)
             estimate = Localiser(SCENE.rig, SCENE.line_map, options).process(10**9, image)
             if estimate.pose is not None:
-                error = estimate.pose.as_array() - pose.as_array()
+                error = estimate.pose.minus(pose)
                 errors.append(float(np.hypot(error[0], error[1])))
     assert len(free) >= 7
     assert np.median(held) > 0.01

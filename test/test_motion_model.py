@@ -20,9 +20,11 @@ import itertools
 
 from hypothesis import given
 from hypothesis import strategies as st
+from nccs_pose.estimation.course import Course
 from nccs_pose.estimation.motion import (
     by_odometry,
     by_velocity,
+    PAST,
     Prediction,
     Track,
 )
@@ -396,3 +398,43 @@ def test_what_a_prediction_may_be_off_by_grows_with_the_motion() -> None:
         by_velocity((before,), last, SECOND // 2 + dt) for dt in (SECOND // 10, SECOND // 2))
     assert soon is not None and later is not None
     assert (np.diag(later.covariance) > np.diag(soon.covariance)).all()
+
+
+def _after(course: Course, stamp_ns: int, x: float, **about: bool) -> Course:
+    return course.after(stamp_ns, Pose2(x, 0.0, 0.0), 1e-6 * np.eye(3), None, **about)
+
+
+def test_a_course_leads_on_by_the_velocity_of_its_last_poses() -> None:
+    assert Course().at(0, None) is None, 'nobody knows where it begins'
+    course = Course()
+    for k in range(6):
+        course = _after(course, k * SECOND // 10, 0.1 * k, is_fixed=True)
+    assert len(course.past) == PAST
+    prediction = course.at(6 * SECOND // 10, None)
+    assert prediction is not None
+    assert prediction.pose.x == pytest.approx(0.6)
+    assert course.seconds_to(6 * SECOND // 10) == pytest.approx(0.1)
+
+
+def test_no_velocity_of_a_course_leads_across_a_jump() -> None:
+    course = _after(_after(Course(), 0, 0.0, is_fixed=True), SECOND // 10, 0.1, is_fixed=True)
+    jumped = _after(course, SECOND // 5, 2.0, is_fixed=True, is_jump=True)
+    assert jumped.past == ()
+    # Nor to where an image sets right what the one before had left open.
+    blind = _after(course, SECOND // 5, 0.2, is_fixed=False)
+    assert blind.last is not None and blind.last.seen_ns == SECOND // 10
+    assert len(blind.past) == 2
+    right = _after(blind, 3 * SECOND // 10, 0.5, is_fixed=True)
+    assert right.past == () and right.last is not None
+    assert right.last.seen_ns == right.last.stamp_ns
+
+
+def test_a_course_goes_by_the_wheels_until_their_reckoning_breaks_off() -> None:
+    course = Course().after(
+        0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
+    told = course.at(SECOND // 10, Wheels(Pose2(0.1, 0.0, 0.0)))
+    assert told is not None and told.by_odometry
+    assert _difference(told.pose, START @ Pose2(0.1, 0.0, 0.0))[0] < 1e-12
+    broken = course.without_odometry().at(SECOND // 10, Wheels(Pose2(0.1, 0.0, 0.0)))
+    assert broken is not None and not broken.by_odometry
+    assert broken.pose == START

@@ -215,10 +215,10 @@ def test_three_lines_hold_no_pose_where_the_fourth_is_seen_beside_its_place(
 ) -> None:
     """A pose 0.13 m off, on which three lines lie, and the fourth two pixels from its place."""
     scene = ideal_scene(640, 0.02)
+    higher = RigidTransform.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, height))
     stands = dataclasses.replace(
-        scene, sensor=dataclasses.replace(scene.sensor, jpeg_quality=20),
-        rig=dataclasses.replace(scene.rig, T_base_mirror=RigidTransform.from_rpy(
-            (0.0, 0.0, 0.0), (0.0, 0.0, height)) @ scene.rig.T_base_mirror))
+        scene.mounted(higher @ scene.rig.T_base_mirror),
+        sensor=dataclasses.replace(scene.sensor, jpeg_quality=20))
     rng = np.random.default_rng([707, 58])
     pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
     estimate = Localiser(scene.rig, scene.line_map).process(0, render(stands, pose, rng))

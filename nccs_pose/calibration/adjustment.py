@@ -30,20 +30,18 @@ from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.problem import Linearisation, Problem
 from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.errors import CalibrationError, GeometryError
+from nccs_pose.estimation.robust import CAUCHY, robust_scale, VAGUE_INFORMATION
 from nccs_pose.geometry.pose import Array
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-# Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
-_CAUCHY = 2.385
 _GATE = 4.0  # robust standard deviations; 6 in 100 000 good pixels lie outside
 _CHANCE = 1e-3  # probability with which noise as told widens the claims
 _SOUND = 5.0  # robust residual in units of the noise as told, beyond which nothing fits yet
 _FEET = 2  # how often the feet of the perpendiculars are dropped
+_MOST_STEPS = 60
 _MISSED = 1e3  # whitened residual of a pixel whose ray misses the mirror: costly, but no pull
-# A pose is somewhere within 100 m and 10 rad: keeps every block regular, moves nothing.
-_VAGUE = np.diag([1e-4, 1e-4, 1e-2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +89,7 @@ class ArrowSystem:
             the poses give way to the rig.
         """
         diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + _VAGUE + damping * np.eye(3) * diagonal[:, None, :]
+        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
         gain = np.linalg.solve(poses, self.coupling)
         rig = self.rig
         rig = rig + damping * np.diag(np.diag(rig))
@@ -100,7 +98,7 @@ class ArrowSystem:
 
     def pulls(self) -> tuple[Array, Array]:
         """Slope (F, P) and curvature (F, P, P) of each frame alone, its pose eliminated."""
-        gain = np.linalg.solve(self.poses + _VAGUE, self.coupling)
+        gain = np.linalg.solve(self.poses + VAGUE_INFORMATION, self.coupling)
         return (self.rig_slopes - np.einsum('fip,fi->fp', gain, self.pose_slopes),
                 self.rigs - np.einsum('fip,fiq->fpq', self.coupling, gain))
 
@@ -111,7 +109,7 @@ class ArrowSystem:
         scaled = information * np.outer(spread, spread) + np.eye(len(spread))
         step = -spread * np.linalg.solve(scaled, spread * slope + theta / spread)
         diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + _VAGUE + damping * np.eye(3) * diagonal[:, None, :]
+        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
         alone = np.linalg.solve(poses, self.pose_slopes[:, :, None])[:, :, 0]
         return step, -alone - gain @ step
 
@@ -153,7 +151,7 @@ class Adjustment:
 
 def adjust(
     parameters: RigParameters, observations: Observations, poses: Array, *,
-    theta: Array | None = None, max_iterations: int = 60,
+    theta: Array | None = None,
 ) -> Adjustment:
     """Refine the rig and the poses together.
 
@@ -168,7 +166,7 @@ def adjust(
     theta = np.zeros(len(parameters)) if theta is None else np.array(theta, dtype=float)
     everything = np.ones(len(observations), dtype=bool)
     theta, poses, terms, ended, used = _descend(
-        problem, theta, np.array(poses, dtype=float), everything, True, max_iterations)
+        problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
     scale = _robust_scale(terms)
     inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
     if inlier.sum() < 3 * observations.frames + len(parameters):
@@ -180,7 +178,7 @@ def adjust(
         if scale <= _SOUND:
             problem.drop_feet(theta, poses)
         theta, poses, terms, finished, more = _descend(
-            problem, theta, poses, inlier, False, max_iterations)
+            problem, theta, poses, inlier, cauchy=False)
         used += more
     e = terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
@@ -207,19 +205,18 @@ def posterior(information: Array, spread: Array) -> Array:
 
 
 def _robust_scale(terms: Linearisation) -> float:
-    residual = np.abs(terms.residual[terms.hit])
-    return max(1.0, 1.4826 * float(np.median(residual))) if len(residual) else _MISSED
+    residual = terms.residual[terms.hit]
+    return robust_scale(residual) if len(residual) else _MISSED
 
 
 def _descend(
-    problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], cauchy: bool,
-    max_iterations: int,
+    problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], *, cauchy: bool,
 ) -> tuple[Array, Array, Linearisation, bool, int]:
     """Levenberg-Marquardt; returns where it ends, whether it converged, and the steps taken."""
     spread, damping = problem.parameters.spread, 0.0
     terms = problem.linearise(theta, poses)
-    for iteration in range(max_iterations):
-        width = _CAUCHY * _robust_scale(terms) if cauchy else np.inf
+    for iteration in range(_MOST_STEPS):
+        width = CAUCHY * _robust_scale(terms) if cauchy else np.inf
         weight = chosen / (1.0 + (terms.residual / width) ** 2)
         system = ArrowSystem.of(terms, weight, problem.slices)
         step, pose_step = system.solve(theta, spread, damping)
@@ -240,7 +237,7 @@ def _descend(
             return theta, poses, terms, True, iteration + 1
         if damping > 1e8:
             return theta, poses, terms, False, iteration + 1
-    return theta, poses, terms, False, max_iterations
+    return theta, poses, terms, False, _MOST_STEPS
 
 
 def _squared_size(system: ArrowSystem, step: Array, pose_step: Array, spread: Array) -> float:

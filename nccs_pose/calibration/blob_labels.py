@@ -25,7 +25,7 @@ from collections.abc import Iterable
 from itertools import permutations
 
 from nccs_pose.calibration.first_poses import first_pose
-from nccs_pose.calibration.observations import FrameObservation
+from nccs_pose.calibration.observations import evenly, FrameObservation
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
@@ -51,8 +51,7 @@ def label_blobs(
     if len(line_map) > _MOST_LINES:
         return frames, np.zeros((0, 3))
     every = list(images)
-    chosen = np.linspace(0, len(every) - 1, min(len(every), _FRAMES)).round().astype(int)
-    for index in chosen:
+    for index in evenly(len(every), _FRAMES):
         stamp_ns, image = every[index]
         found = _assign(rig, line_map, stamp_ns, image)
         if found is not None:
@@ -72,7 +71,7 @@ def _assign(
     results = []
     for lines in permutations(range(len(line_map)), len(blobs)):
         points = LinePoints(pixels, np.full(len(pixels), _SIGMA), np.array(lines)[blob])
-        frame = FrameObservation(stamp_ns, points, np.zeros(len(pixels), dtype=np.int8))
+        frame = FrameObservation.of_middles(stamp_ns, points)
         pose, score = first_pose(rig, line_map, frame)
         if pose is not None:
             results.append((score, frame, pose))

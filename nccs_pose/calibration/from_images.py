@@ -23,16 +23,21 @@ from itertools import islice
 import math
 
 from nccs_pose.calibration.blob_labels import label_blobs
-from nccs_pose.calibration.observations import FrameObservation
+from nccs_pose.calibration.observations import (
+    evenly,
+    FrameObservation,
+    LEAST_LINES,
+    observed,
+)
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.calibration.procedure import calibrate, Calibration, converge
 from nccs_pose.errors import CalibrationError, FrameRefusedError
-from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +48,6 @@ Images = Callable[[], Iterable[tuple[int, Image]]]
 _PASSES = 4
 _FEWEST = 2  # images that a better rig may be estimated from, to follow more under it
 _SOME = 30  # images that are tried by themselves, and that a rig is tried on
-_LEAST_LINES = 2
-_LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
 # A rough rig fits a single image better if that image may have a height and a tilt of its own.
 _ROUGHLY = LocaliserOptions(height_sigma=0.01, tilt_sigma=0.005)
 # In the end height and tilt are what is to be found; no frame may have its own.
@@ -92,27 +95,13 @@ def measure(
             reasons[error.cause] += 1
             continue
         look(estimate)
-        found = _found(estimate, doubted)
+        found = observed(estimate, doubted=doubted)
         if found is None:
             reasons[estimate.reason] += 1
             continue
         frames.append(found[0])
         poses.append(found[1].as_array())
     return Measured(frames, np.array(poses).reshape(-1, 3), seen, reasons)
-
-
-def _found(estimate: Estimate, doubted: bool) -> tuple[FrameObservation, Pose2] | None:
-    """What an answer says of the lines, and the pose that it believes, or doubts."""
-    pose, points, least = estimate.pose, estimate.points, 1
-    if estimate.state is not State.TRACKING:
-        if not doubted or estimate.doubted is None:
-            return None
-        pose, points, least = estimate.doubted.pose, estimate.doubted.points, _LEAST_DOUBTED
-    if pose is None or points is None:
-        return None
-    points = points[points.label >= 0]
-    frame = FrameObservation(estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8))
-    return (frame, pose) if len(frame.lines) >= least else None
 
 
 def calibrate_images(
@@ -211,7 +200,7 @@ def _measure_roughly(rig: Rig, line_map: LineMap, images: Images) -> Measured:
 
 
 def _usable(measured: Measured) -> int:
-    return sum(len(frame.lines) >= _LEAST_LINES for frame in measured.frames)
+    return sum(len(frame.lines) >= LEAST_LINES for frame in measured.frames)
 
 
 def _nothing(measured: Measured) -> str:
@@ -236,8 +225,7 @@ def _from_single_images(
     best, most = None, _FEWEST - 1
     # Read once: every rig is tried on them.
     some = list(islice(images(), 0, None, math.ceil(measured.seen / _SOME)))
-    for k in np.linspace(
-            0, len(measured.frames) - 1, min(len(measured.frames), _SOME)).round().astype(int):
+    for k in evenly(len(measured.frames), _SOME):
         try:
             better = _refined(
                 parameters, measured.frames[k:k + 1], measured.poses[k:k + 1], options)

@@ -37,14 +37,11 @@ class WeakDirection:
     """A combination of numbers that the data see hardly or not at all.
 
     :ivar direction: how theta moves along it, one standard deviation of what is left (P,).
-    :ivar knowledge: how much more the data know of it than the rough value, as a ratio of
-        information; below 1 the rough value holds it.
-    :ivar held: whether it is held by the rough value.
+    :ivar held: whether the rough value says more of it than the data do.
     :ivar words: what it is.
     """
 
     direction: Array
-    knowledge: float
     held: bool
     words: str
 
@@ -58,6 +55,7 @@ def weak_directions(
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
     found = []
     for value, vector in zip(values, vectors.T):
+        # As a ratio of information: the data's over the rough value's.
         knowledge = max(0.0, float(value))
         if knowledge >= _WEAK:
             break
@@ -66,7 +64,7 @@ def weak_directions(
         direction *= np.sign(vector[np.argmax(np.abs(vector))])
         held = knowledge < _HELD
         found.append(WeakDirection(
-            direction, knowledge, held, _words(direction, parameters, model, held)))
+            direction, held, _words(direction, parameters, model, held)))
     return tuple(found)
 
 

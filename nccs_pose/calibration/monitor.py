@@ -44,13 +44,20 @@ from enum import Enum
 from nccs_pose.calibration.adjustment import ArrowSystem
 from nccs_pose.calibration.frames import same_place
 from nccs_pose.calibration.gauge import pose_uncertainty
-from nccs_pose.calibration.observations import FrameObservation, Observations
+from nccs_pose.calibration.observations import (
+    evenly,
+    FrameObservation,
+    LEAST_LINES,
+    Observations,
+    observed,
+)
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.pulls import pull_statistics
 from nccs_pose.errors import GeometryError
-from nccs_pose.estimation.estimate import Estimate, State
+from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.estimation.robust import robust_scale
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
@@ -59,8 +66,6 @@ import numpy as np
 from scipy.stats import f as fisher
 
 _GATE = 4.0  # robust standard deviations of a frame
-_LEAST_LINES = 2
-_LEAST_DOUBTED = 3  # any two lines have a second pose, half a turn about where they meet
 # By so many places, and points of each line, the parts that may have moved are told apart.
 _WITNESSES, _WITNESS_POINTS = 16, 20
 _STEPS = 3
@@ -172,21 +177,16 @@ class CalibrationMonitor:
 
     def add(self, estimate: Estimate) -> None:
         """Look at one answer of the localiser: a pose on two lines, or a doubted one on three."""
-        pose, points, least = estimate.pose, estimate.points, _LEAST_LINES
-        if estimate.state is not State.TRACKING and estimate.doubted is not None:
-            pose, points = estimate.doubted.pose, estimate.doubted.points
-            least = _LEAST_DOUBTED
-        points = points[points.label >= 0] if points else None
-        if pose is None or not points or len(np.unique(points.label)) < least:
+        found = observed(estimate, doubted=True)
+        if found is None or len(found[0].lines) < LEAST_LINES:
             self._asked, self._mute = self._asked + 1, self._mute + 1
-            return
-        self.add_frame(FrameObservation(
-            estimate.stamp_ns, points, np.zeros(len(points), dtype=np.int8)), pose)
+        else:
+            self.add_frame(*found)
 
     def add_frame(self, frame: FrameObservation, pose: Pose2) -> None:
         """Look at measurements of one frame and the pose that they gave."""
         self._asked += 1
-        if len(frame.lines) < _LEAST_LINES:
+        if len(frame.lines) < LEAST_LINES:
             return
         frame = frame.thinned(self.options.points_per_line)
         observations = Observations.stack([frame], self._parameters.rough.line_map)
@@ -196,7 +196,7 @@ class CalibrationMonitor:
         terms = problem.linearise(as_told, here[None])
         if terms.hit.sum() < 12:
             return
-        scale = max(1.0, 1.4826 * float(np.median(np.abs(terms.residual[terms.hit]))))
+        scale = robust_scale(terms.residual[terms.hit])
         # Least squares over what is no outlier: a weight that falls with the residual would make
         # the step that the pulls ask for too short.
         inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
@@ -264,7 +264,7 @@ class CalibrationMonitor:
         part is solved for together with the poses.
         """
         places = list(self._places)
-        rows = np.linspace(0, len(places) - 1, min(len(places), _WITNESSES)).round().astype(int)
+        rows = evenly(len(places), _WITNESSES)
         observations = Observations.stack(
             [places[k].frame for k in rows], self._parameters.rough.line_map)
         problem = Problem(self._parameters, observations, check=False)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Line measurements of many frames, stacked for one adjustment."""
+"""What frames show of the map's lines, one by one and stacked for one adjustment."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from nccs_pose.errors import CalibrationError
+from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.line_points import LinePoints
 import numpy as np
 from numpy.typing import NDArray
+
+LEAST_LINES = 2
+"""A frame that shows fewer lines fixes no pose."""
+# A doubted pose rests on so many: any two have a second one, half a turn about where they meet.
+_LEAST_DOUBTED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +59,11 @@ class FrameObservation:
         if len(self.points) and self.points.label.min() < 0:
             raise CalibrationError(f'frame {self.stamp_ns}: a point has no line (label -1)')
 
+    @classmethod
+    def of_middles(cls, stamp_ns: int, points: LinePoints) -> FrameObservation:
+        """From points on the middle of the tapes."""
+        return cls(stamp_ns, points, np.zeros(len(points), dtype=np.int8))
+
     @property
     def lines(self) -> NDArray[np.intp]:
         """Indices of the lines that are seen."""
@@ -64,9 +75,30 @@ class FrameObservation:
         edge = 3 * self.points.label + self.side
         for value in np.unique(edge):
             rows = np.flatnonzero(edge == value)
-            keep[rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).round()
-                                .astype(int))]] = True
+            keep[rows[evenly(len(rows), most)]] = True
         return FrameObservation(self.stamp_ns, self.points[keep], self.side[keep])
+
+
+def evenly(count: int, most: int) -> NDArray[np.intp]:
+    """The numbers of at most so many of a count of things, evenly spread from first to last."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+
+
+def observed(estimate: Estimate, *, doubted: bool) -> tuple[FrameObservation, Pose2] | None:
+    """What an answer of the localiser says of the lines, and the pose by which it says so.
+
+    :param doubted: take a pose that it doubts as well, if that rests on three lines.
+    :returns: None where there is no such pose, or no line.
+    """
+    pose, points, least = estimate.pose, estimate.points, 1
+    if estimate.state is not State.TRACKING:
+        if not doubted or estimate.doubted is None:
+            return None
+        pose, points, least = estimate.doubted.pose, estimate.doubted.points, _LEAST_DOUBTED
+    if pose is None or points is None:
+        return None
+    frame = FrameObservation.of_middles(estimate.stamp_ns, points[points.label >= 0])
+    return (frame, pose) if len(frame.lines) >= least else None
 
 
 @dataclass(frozen=True, eq=False)

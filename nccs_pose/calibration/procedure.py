@@ -29,7 +29,12 @@ from nccs_pose.calibration.gauge import (
     WeakDirection,
 )
 from nccs_pose.calibration.judgement import judge, Judgement
-from nccs_pose.calibration.observations import FrameObservation, Observations
+from nccs_pose.calibration.observations import (
+    evenly,
+    FrameObservation,
+    LEAST_LINES,
+    Observations,
+)
 from nccs_pose.calibration.options import CalibrationOptions
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.problem import Problem
@@ -41,7 +46,6 @@ from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
 
-_LEAST_LINES = 2
 _START_FRAMES = 12
 _MOST_SCALE = 2.0  # residuals over the noise that was measured
 _NO_WORSE = 1.5  # held-out residuals over those of the fit
@@ -94,13 +98,14 @@ def calibrate(
     """
     options = options or CalibrationOptions()
     parameters = RigParameters(rig, line_map, options, free_lines)
-    usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= _LEAST_LINES]
+    usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= LEAST_LINES]
     _demand_frames(len(usable), len(frames), options.min_frames)
     thin = [frames[i].thinned(options.points_per_edge) for i in usable]
     given = None if poses is None else np.asarray(poses, dtype=float)[usable]
 
     first = _start(parameters, thin, given)
-    theta, all_poses, agree = _pose_all(parameters, thin, first)
+    theta = first.adjustment.theta
+    all_poses, agree = _pose_all(thin, first)
     judges = np.zeros(len(thin), dtype=bool)
     judges[options.held_out - 1::options.held_out] = True
     pool = np.flatnonzero(agree & ~judges)
@@ -131,7 +136,7 @@ def converge(
 
     :raises CalibrationError: if nothing explains them.
     """
-    usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= _LEAST_LINES]
+    usable = [i for i, frame in enumerate(frames) if len(frame.lines) >= LEAST_LINES]
     _demand_frames(len(usable), len(frames), 1)
     thin = [frames[i].thinned(options.points_per_edge) for i in usable]
     return _start(parameters, thin, np.asarray(poses, dtype=float)[usable]).adjustment.theta
@@ -167,12 +172,9 @@ def _start(
         if len(known) < _START_FRAMES // 2:
             poses = None
     if poses is None:
-        few = np.linspace(0, len(frames) - 1, min(len(frames), _START_FRAMES))
-        rows = few.round().astype(int)
-        found = start(parameters, [frames[i] for i in rows])
+        found = start(parameters, [frames[i] for i in evenly(len(frames), _START_FRAMES)])
     else:
-        rows = known[np.linspace(0, len(known) - 1, min(len(known), 2 * _START_FRAMES))
-                     .round().astype(int)]
+        rows = known[evenly(len(known), 2 * _START_FRAMES)]
         found = start(parameters, [frames[i] for i in rows], poses[rows])
         if not found.settled:
             return _start(parameters, frames, None)
@@ -187,17 +189,17 @@ def _start(
 
 
 def _pose_all(
-    parameters: RigParameters, frames: list[FrameObservation], first: Start,
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Pose every frame under the refined rig.
+    frames: list[FrameObservation], first: Start,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Pose every frame under the first refined rig.
 
-    :returns: theta (P,), poses (F, 3), and which frames agree with the rig (F,).
+    :returns: poses (F, 3), and which frames agree with the rig (F,).
     """
-    theta, model = first.adjustment.theta, first.adjustment.model
+    model = first.adjustment.model
     poses, _ = first_poses(model.rig, model.line_map, frames, rough=False)
     judged = judge(model, model, frames, poses)
     limit = 3.0 * max(1.0, first.adjustment.scale)
-    return theta, judged.poses, judged.after_whitened <= limit
+    return judged.poses, judged.after_whitened <= limit
 
 
 def _demand_frames(usable: int, frames: int, least: int) -> None:

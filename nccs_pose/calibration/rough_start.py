@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 from nccs_pose.calibration.adjustment import adjust, Adjustment
 from nccs_pose.calibration.first_poses import first_poses
-from nccs_pose.calibration.observations import FrameObservation, Observations
+from nccs_pose.calibration.observations import evenly, FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.errors import CalibrationError, GeometryError
 from nccs_pose.geometry.pose import Array, wrap_angle
@@ -94,8 +94,7 @@ def start(
 def _starts(parameters: RigParameters, frames: list[FrameObservation]) -> Iterator[Array]:
     """The rough rig, then the rigs in its neighbourhood under which frames look best."""
     yield np.zeros(len(parameters))
-    rows = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLED)).round().astype(int)
-    some = [frames[i] for i in rows]
+    some = [frames[i] for i in evenly(len(frames), _SAMPLED)]
     judged = []
     for theta in _neighbours(parameters):
         try:

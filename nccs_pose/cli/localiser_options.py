@@ -47,7 +47,7 @@ def odometry_frames(parameter_file: Path | None) -> tuple[str, str]:
 
     :raises FileError: if the file names no frames.
     """
-    given = load_parameters(parameter_file, 'localiser') if parameter_file is not None else {}
+    given = load_parameters(parameter_file) if parameter_file is not None else {}
     frames = {name: given[name] for name in _FRAMES if name in given}
     try:
         node = NodeOptions(**frames)
@@ -60,7 +60,7 @@ def _from_file(path: Path) -> dict[str, Any]:
     """The localiser's part of the node's parameters; what is the node's own is left to it."""
     own = {field.name for field in dataclasses.fields(NodeOptions)}
     values: dict[str, Any] = {}
-    for name, value in load_parameters(path, 'localiser').items():
+    for name, value in load_parameters(path).items():
         if name in _FIELDS:
             try:
                 check_value(_FIELDS[name], value)

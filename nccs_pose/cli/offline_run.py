@@ -20,25 +20,15 @@ from dataclasses import dataclass
 import json
 import math
 import time
-from typing import Any, Protocol
+from typing import Any
 
 from nccs_pose.errors import FrameRefusedError, NccsPoseError, VisionError
-from nccs_pose.estimation.estimate import Estimate, Quality
+from nccs_pose.estimation.estimate import Answering, Estimate, Quality
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.decode import Image
 import numpy as np
-
-
-class Answering(Protocol):
-    """What a localiser must be able to do to be replayed."""
-
-    def process(self, stamp_ns: int, image: Image) -> Estimate:
-        """Answer an image; may refuse it with one of the project's errors."""
-
-    def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
-        """Take notice of the wheels; may refuse a sample with a FrameRefusedError."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +71,7 @@ def run_events(
                 localiser.add_odometry(event.stamp_ns, event.pose)
             except FrameRefusedError:
                 continue  # odometry began anew
-        elif isinstance(event, StampedImage):
+        else:
             record, image = _run_image(localiser, event, len(records))
             records.append(record)
             on_frame(record, image)

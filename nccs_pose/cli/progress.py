@@ -18,7 +18,6 @@ from __future__ import annotations
 import sys
 import time
 from types import TracebackType
-from typing import TextIO
 
 _TERMINAL_PERIOD = 0.1
 _PLAIN_PERIOD = 5.0
@@ -31,12 +30,11 @@ class Progress:
 
     :param total: number of steps to come.
     :param what: what is counted, e.g. ``frames``.
-    :param stream: where to write; stderr.
     """
 
-    def __init__(self, total: int, what: str, stream: TextIO | None = None) -> None:
+    def __init__(self, total: int, what: str) -> None:
         self._total, self._what = total, what
-        self._stream = sys.stderr if stream is None else stream
+        self._stream = sys.stderr
         self._moves = self._stream.isatty()
         self._period = _TERMINAL_PERIOD if self._moves else _PLAIN_PERIOD
         self._start = self._last = time.monotonic()

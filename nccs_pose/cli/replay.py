@@ -28,7 +28,6 @@ from nccs_pose.argument_types import whole
 from nccs_pose.cli.localiser_options import make_options, odometry_frames
 from nccs_pose.cli.offline_run import (
     answered_poses,
-    Answering,
     FrameRecord,
     record_line,
     run_events,
@@ -36,7 +35,7 @@ from nccs_pose.cli.offline_run import (
 from nccs_pose.cli.paper_localiser import PaperLocaliser
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
-from nccs_pose.estimation.estimate import StageTimes
+from nccs_pose.estimation.estimate import Answering, StageTimes
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import (

@@ -17,10 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from nccs_pose.estimation.alignment import Alignment, close, leaves_open
+from nccs_pose.estimation.alignment import Alignment, close, leaves_open, Pass
 from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
@@ -34,49 +34,66 @@ from numpy.typing import NDArray
 
 # Stations stand no closer in the image than this, px; of a short piece there are fewer.
 SPACING = 2.0
-# To follow a robot they are chosen for poses so far apart, m and rad: one in between sees those of
-# the nearest about as evenly spaced, and a robot has moved so little in most images that no others
-# are needed. So many choices are remembered, as it may stand where two meet.
+# To follow a robot, stations are chosen for poses on a lattice of this spacing, m and rad: from
+# anywhere near one of these they look about as evenly spaced, and most images need no new choice.
+# So many choices are remembered, as a robot may stand where several meet.
 _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
-# Where the image is sharp, so that a tape is felt from nearby only, or the start a little off, a
-# first, rough pass takes one station of so many. On more curve than this, px, these few show what
-# tapes look like as well, and a second pass takes some too.
+# Where the image is sharp, so that a tape is found from nearby only, or the start is a little off,
+# a first, rough pass takes one station in four. Where more curve than this is in view, px, these
+# few show what tapes look like as well, and a second pass takes one in two.
 _SOME = (4, 2)
 _LONG = 2000.0
-# What a first pass moves a start by more than this, px, that should be off by less than that, is
-# nowhere near.
+# A start that should be off by LINEAR_PX at most, but is moved by more than this, px, in its first
+# pass is nowhere near.
 _ASTRAY_PX = 5.0
-# A search that ends this near a pose, m and rad, is refined to it.
+# Poses this close, m and rad, are refined to the same one.
 _SAME = (0.01, 0.005)
 _ITERATIONS = 8
-# The poses have settled when the last step moved no station by more than this share of the blur
-# (profiles miss a hundredth or two of a larger shift, all of them alike: three times as much cost
-# half a standard deviation), or when it was below half a standard deviation.
+# A pose has settled when its last step moved no station by more than this share of the blur, or
+# was below half a standard deviation. (Profiles miss a hundredth or two of a larger shift, all of
+# them alike: three times this share cost half a standard deviation.)
 _SETTLED_BLURS = 0.1
 _SETTLED = 0.5
-# Of a robot that is followed one pass is enough if it misses no more of its step than so many
-# standard deviations: this part of it and, times the square of the blurs that it moves a station
-# by, that part.
+# To follow a robot one pass is enough if it misses less of its step than so many standard
+# deviations. It misses the part MISSED, and MISSED_BEYOND times the square of the blurs that it
+# moves a station by.
 _FOLLOWED = 0.2
 _MISSED = 0.01
 _MISSED_BEYOND = 0.05
-# Nor does a pass count that has just learned a blur so different, px: a template too soft or too
-# sharp takes a step for larger or smaller than it is.
+# No pose has settled in a pass that learned a blur so different, px, from the one it went by: a
+# template too soft or too sharp takes a step for larger or smaller than it is.
 _LEARNED_BLUR = 0.1
 # Up to a step so large, px, what stations slide by is proportional to it: they are measured again
 # without a look at the image.
 _SLIDING_PX = 1.0
 # After a step larger than this the stations are chosen anew, px.
 _MOVED_PX = 3.0
-# What still steps at the end, by less than this (m and rad), is uncertain by that much more.
+# A pose that still moves in the last pass is given if it does by less than this, m and rad; it is
+# uncertain by that step besides.
 _LAST_STEP = 0.005
-# A pose rests on so much of curve, px.
+# A pose has to rest on so much curve, px.
 _LEAST_LENGTH = 192.0
-# Of a searched pose this part of what must be found at the end has to be found from the first.
-_HOPELESS = 0.8
+# From its first pass on, a pose that is searched has to show this part of what it must in the end.
+_AT_FIRST = 0.8
 # A pass that moves no station further than this, px, shows the lines that the last will.
 _NEARLY = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """What is known of a pose from one pass over an image to the next.
+
+    :ivar pose: T_map_base.
+    :ivar attitude: of the base off its plane, (z, roll, pitch) (3,), metres and rad.
+    :ivar colours: what the tapes look like.
+    :ivar is_tried: whether a pass over some of the stations has been made.
+    """
+
+    pose: Pose2
+    attitude: Array
+    colours: tuple[LineColour, ...]
+    is_tried: bool = False
 
 
 class Aligner:
@@ -117,11 +134,11 @@ class Aligner:
             are searched first; 0 is for a start that is most likely right.
         :param prior: a pose with its information (3, 3): carries the directions that the lines in
             view do not fix.
-        :param hopeless: whether a pose that will not move any further is refused in any case: one
-            that is comes back as it is, before it has settled; so does one of which a direction
-            is left open.
-        :param laid: what the start was laid to by what is near its place. No search is followed
-            that leads there, or to the start again, or that leaves a direction of the pose open.
+        :param hopeless: says of a pose that has nearly settled whether it is refused in any case.
+            If so it is given as it is, which saves the last passes; so is one of which the lines
+            leave a direction open.
+        :param laid: the pose that the same start came to with a smaller reach. A search is not
+            followed if it leads there, or back to the start, or leaves a direction open.
         :returns: None where too little of what the start predicts is found, where a search leads
             to nothing new, or where the poses do not settle.
         """
@@ -134,56 +151,58 @@ class Aligner:
         places = self._places(pose) if reach > 0.0 else self._places_near(pose)
         if len(places) < LEAST_STATIONS or places.length < _LEAST_LENGTH:
             return None
-        begun = self._begun(image, places, pose, prior, colours, reach)
-        if begun is None:
-            return None
-        tried = begun[0] is not pose
-        pose, attitude, colours = begun
-        before = pose
+        begun = self._begun(image, places, _State(pose, np.zeros(3), colours), prior, reach)
+        return None if begun is None else self._settled(
+            image, places, begun, prior, reach, hopeless)
+
+    def _settled(
+        self, image: NDArray[np.uint8], places: Places, state: _State,
+        prior: tuple[Pose2, Array] | None, reach: float,
+        hopeless: Callable[[Alignment], bool] | None,
+    ) -> Alignment | None:
+        """Pass over an image until the pose moves no more, or will be refused in any case.
+
+        :param places: where the stations stand to begin with.
+        """
+        followed, before = reach == 0.0, state.pose
         for k in range(_ITERATIONS):
-            look = self._measurer.look(image, places, pose, attitude, colours)
+            look = self._measurer.look(image, places, state.pose, state.attitude, state.colours)
             if look is None:
                 return None
-            measured = self._measurer.measure(look, prior, colours)
+            measured = self._measurer.measure(look, prior, state.colours)
             if measured is None or measured.length < _LEAST_LENGTH:
                 return None
-            known, colours = colours, measured.colours
-            result, last = measured.refinement, measured
-            if reach > 0.0 and (measured.alignment.explained
-                                < _HOPELESS * self._options.least_explained):
+            if not followed and (measured.alignment.explained
+                                 < _AT_FIRST * self._options.least_explained):
                 return None
-            steady, blurs = _is_steady(known, colours), measured.moved / _sharpest(colours)
+            pose, covariance = measured.refinement.pose, measured.refinement.covariance
+            steady = _is_steady(state.colours, measured.colours)
+            blurs = measured.moved / _sharpest(measured.colours)
+            # The pass has missed about this part of its step.
             part = _MISSED + _MISSED_BEYOND * blurs**2
-            settled = steady and (blurs < _SETTLED_BLURS or close(
-                result.pose, pose, result.covariance,
-                _SETTLED if reach > 0.0 else _FOLLOWED / part))
-            # The first pass learns what tapes look like, and may miss what the next one finds. If
-            # it misses nothing, which way lines run does not depend on how blurred they are.
-            if hopeless is not None and measured.moved < LINEAR_PX:
-                settled = settled or (
-                    (k > 0 or (tried and not measured.alignment.missing))
-                    and (steady or measured.alignment.is_sharp) and leaves_open(result)) or (
-                    k > 0 and steady and measured.moved < _NEARLY
-                    and hopeless(measured.alignment))
-            # Stations that come and go near their thresholds can keep it stepping to and fro: it
-            # ends as the last pass would.
-            returns = steady and close(result.pose, before, result.covariance, _SETTLED)
-            before, pose, attitude = pose, result.pose, result.attitude
-            if settled:
+            if steady and (blurs < _SETTLED_BLURS or close(
+                    pose, state.pose, covariance, _FOLLOWED / part if followed else _SETTLED)):
+                return measured.alignment
+            if hopeless is not None and _is_in_vain(
+                    measured, hopeless, steady=steady, first=k == 0, tried=state.is_tried):
                 return measured.alignment
             # Measured again, it misses that part of that part.
-            if reach == 0.0 and steady and measured.moved < _SLIDING_PX and close(
-                    pose, before, result.covariance, _FOLLOWED / part**2):
+            if followed and steady and measured.moved < _SLIDING_PX and close(
+                    pose, state.pose, covariance, _FOLLOWED / part**2):
                 return self._measurer.measure_again(look, measured).alignment
+            # Stations that come and go near their thresholds can keep it stepping to and fro
+            # between two poses: it stops at the one where the last of all passes would end.
+            returns = steady and close(pose, before, covariance, _SETTLED)
+            last, before, state = measured, state.pose, _State(
+                pose, measured.refinement.attitude, measured.colours, state.is_tried)
             if returns and (_ITERATIONS - k) % 2 == 1:
                 break
             if measured.moved > _MOVED_PX:
                 places = self._places(pose)
-        step = pose.minus(before)
+        step = state.pose.minus(before)
         if np.abs(step).max() > _LAST_STEP:
             return None
-        return replace(
-            last.alignment, covariance=result.covariance + np.outer(step, step))
+        return replace(last.alignment, covariance=covariance + np.outer(step, step))
 
     def lines_in_view(self, pose: Pose2) -> int:
         """How many lines a pose says that an image shows."""
@@ -209,7 +228,7 @@ class Aligner:
     ) -> Pose2 | None:
         """Where a search across the bands leads; None where to nothing, or to nothing new."""
         # About as much is in view from where it leads.
-        if self._places(start).length < _HOPELESS * _LEAST_LENGTH:
+        if self._places(start).length < _AT_FIRST * _LEAST_LENGTH:
             return None
         searched = self._measurer.search(image, start, prior, colours, reach)
         if searched is None or (laid is not None and (
@@ -219,27 +238,27 @@ class Aligner:
         return searched.pose
 
     def _begun(
-        self, image: NDArray[np.uint8], places: Places, start: Pose2,
-        prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...], reach: float,
-    ) -> tuple[Pose2, Array, tuple[LineColour, ...]] | None:
-        """The pose, the base's attitude and the colours to go on from.
+        self, image: NDArray[np.uint8], places: Places, start: _State,
+        prior: tuple[Pose2, Array] | None, reach: float,
+    ) -> _State | None:
+        """What to go on from with all stations.
 
-        Where the start may be off they are of passes over some of the stations, until all will
-        hardly say anything else. None where it may be, and too little is found.
+        A start that may be off is corrected by passes over some of them, until all would hardly
+        say anything else. None where it may be off, and too little is found.
         """
-        pose, attitude = start, np.zeros(3)
-        inexact = _sharpest(colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
+        inexact = _sharpest(start.colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
         long = reach > 0.0 and places.length > _LONG
         if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
-            return pose, attitude, colours
-        followed = reach == 0.0
+            return start
+        followed, state = reach == 0.0, start
         # A robot that is followed may be so far off that it takes two.
         for k, step in enumerate(_SOME[:1] * 2 if followed else _SOME[:1 + long]):
-            sharpest = _sharpest(colours)
+            sharpest = _sharpest(state.colours)
             look = self._measurer.look(
-                image, places.every(step), pose, attitude, colours,
+                image, places.every(step), state.pose, state.attitude, state.colours,
                 rough=not long or (k == 0 and sharpest < ROUGH_BLUR))
-            measured = None if look is None else self._measurer.measure(look, prior, colours)
+            measured = None if look is None else self._measurer.measure(
+                look, prior, state.colours)
             if look is None or measured is None:
                 if inexact and reach > 0.0:
                     return None
@@ -249,14 +268,38 @@ class Aligner:
             near = measured.moved < LINEAR_PX
             if followed and near:
                 measured = self._measurer.measure_again(look, measured)
-            # What profiles bear needs no bands of its own.
+            # A lean so small that profiles bear it needs no bands of its own.
             leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest
-            pose, attitude = measured.refinement.pose, (
-                measured.refinement.attitude if leans else attitude)
-            known, colours = colours, measured.colours
-            if near and _is_steady(known, colours):
+            before, state = state, _State(
+                measured.refinement.pose,
+                measured.refinement.attitude if leans else state.attitude, measured.colours,
+                is_tried=True)
+            if near and _is_steady(before.colours, state.colours):
                 break
-        return pose, attitude, colours
+        return state
+
+
+def _is_in_vain(
+    measured: Pass, hopeless: Callable[[Alignment], bool], *, steady: bool, first: bool,
+    tried: bool,
+) -> bool:
+    """Whether a pose will be refused in any case, though it has not settled.
+
+    The first pass learns what tapes look like, and may miss what the next one finds. If it misses
+    nothing, which way lines run does not depend on how blurred they are.
+
+    :param hopeless: as of :meth:`Aligner.align`.
+    :param steady: whether the pass learned hardly another blur than was known.
+    :param first: whether it is the first over all stations.
+    :param tried: whether one over some of them came before.
+    """
+    alignment = measured.alignment
+    if measured.moved >= LINEAR_PX:
+        return False
+    if (not first or (tried and not alignment.missing)) and (
+            steady or alignment.is_sharp) and leaves_open(measured.refinement):
+        return True
+    return not first and steady and measured.moved < _NEARLY and hopeless(alignment)
 
 
 def _near(a: Pose2, b: Pose2) -> bool:

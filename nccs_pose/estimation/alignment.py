@@ -59,7 +59,7 @@ class Alignment:
     :ivar missing: map lines that should be seen plainly and are not there.
     :ivar support: fraction of each map line's predicted stations that the pose rests on (L,);
         NaN where the line is not in view.
-    :ivar whole: the first of the lines that each is one with in an image (L,).
+    :ivar whole: of each line of the map the first of those that look like one line with it (L,).
     :ivar offset: by which each group of neighbours lies off its line (G,), px.
     :ivar offset_label: line of each group (G,).
     :ivar colours: the colours as this image shows them.
@@ -119,7 +119,7 @@ class Pass:
     :ivar weighed: what the stations say, by the weights that they have.
     :ivar moved: how far the solve moves the station that it moves farthest, px.
     :ivar leant: how far height, roll and pitch alone move each (N,), px.
-    :ivar whole: of each line of the map, the first of those that it is one with (L,).
+    :ivar whole: as of :class:`Alignment`.
     """
 
     weighed: WeighedShifts

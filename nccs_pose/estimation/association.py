@@ -31,7 +31,7 @@ from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines, poses_of_pairs
-from nccs_pose.estimation.strip_scores import Place, StripScorer
+from nccs_pose.estimation.strip_scores import SeenMap, StripScorer
 from nccs_pose.estimation.symmetries import map_symmetries
 from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
@@ -98,8 +98,8 @@ class Associator:
         """
         lines = FloorLines(line_map)
         self._joined = lines if joined is None or joined is line_map else FloorLines(joined)
-        self._place = Place(lines, NearestLines(lines), FloorScale(table))
-        self._likenesses = _likenesses(line_map, self._place)
+        self._seen = SeenMap(lines, NearestLines(lines), FloorScale(table))
+        self._likenesses = _likenesses(line_map, self._seen)
         self._last: StripScorer | None = None
 
     def candidates(
@@ -167,7 +167,7 @@ class Associator:
         :param spread: xx, xy and yy of J J^T (P, 3), J the point's derivative by the pixel.
         :param width: of the tapes, metres.
         """
-        turn, nearest = complex(math.cos(pose.yaw), math.sin(pose.yaw)), self._place.nearest
+        turn, nearest = complex(math.cos(pose.yaw), math.sin(pose.yaw)), self._seen.nearest
         which, across = nearest.at(
             turn * floor + complex(pose.x, pose.y), nearest.layers((colour,)))
         normals = as_points(nearest.normal.take(which) * turn.conjugate())
@@ -176,11 +176,11 @@ class Associator:
     def _scorer(self, segments: tuple[FloorSegment, ...]) -> StripScorer:
         """Of the strips, which are most often those that were last asked about."""
         if self._last is None or self._last.segments is not segments:
-            self._last = StripScorer(segments, self._place)
+            self._last = StripScorer(segments, self._seen)
         return self._last
 
 
-def _likenesses(line_map: LineMap, place: Place) -> tuple[Pose2, ...]:
+def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
     """Motions of a map that lay its lines near to its lines, but for its symmetries.
 
     None where there are many: no pair of strips tells one from another then, and all are among
@@ -189,8 +189,8 @@ def _likenesses(line_map: LineMap, place: Place) -> tuple[Pose2, ...]:
     tapes = tuple(FloorSegment(
         np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
         line.length, _ASKEW, np.zeros((0, 2)), line.colour) for line in line_map)
-    scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), place)
-    poses = Poses(*poses_of_pairs(scorer.strips, place.lines, _PAIRS))
+    scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), seen)
+    poses = Poses(*poses_of_pairs(scorer.strips, seen.lines, _PAIRS))
     if not 0 < len(poses.place) <= _CLOSE:
         return ()
     poses, claimed, _ = scorer.refined(poses, 4)

@@ -82,7 +82,8 @@ def left_open(
     :returns: those to be laid on the next image, and others that may be right as well.
     """
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
-    # What is left open shows so much of what the best does, in the images before as well.
+    # Scores of what is left open are of this image, as parts of its best; those of hypotheses are
+    # means over several.
     before = best.mean / held[0].score
     most = _CARRIED - 1
     others = sorted(
@@ -91,7 +92,7 @@ def left_open(
     carried_on = (best, *others[:most])
     if lines_used(held[0].alignment) < 3:
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
-    more = [Candidate(h.pose, h.mean) for h in others[most:]]
+    more = [h.candidate for h in others[most:]]
     more += [Candidate(c.pose, before * c.score) for c in (*sifted.open[most:], *sifted.rest)]
     if len(sifted.others.place) > 0:
         # They show no more than the least of what was looked at closely, for all that is known.

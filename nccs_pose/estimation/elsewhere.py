@@ -92,7 +92,7 @@ class Elsewhere:
             return Refused(_ANOTHER, alignment)
         if vague and (self._shows_as_much(found, alignment, here, told)
                       or self._is_one_of_parallels(image, alignment, prediction, told)):
-            # It is no worse than the others.
+            # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
 

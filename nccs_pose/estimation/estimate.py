@@ -19,9 +19,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 import math
+from typing import Protocol
 
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.line_points import LinePoints
+import numpy as np
+from numpy.typing import NDArray
 
 
 class State(Enum):
@@ -154,3 +157,13 @@ class Estimate:
     quality: Quality = field(default_factory=Quality)
     times: StageTimes = field(default_factory=StageTimes)
     doubted: Doubted | None = None
+
+
+class Answering(Protocol):
+    """Whatever answers images like a localiser."""
+
+    def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> Estimate:
+        """Answer an image; may refuse it with one of the project's errors."""
+
+    def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
+        """Take notice of the wheels; may refuse a sample with a FrameRefusedError."""

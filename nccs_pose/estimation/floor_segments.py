@@ -107,7 +107,7 @@ class FloorSegment:
 
 def floor_segments(
     segmentation: Segmentation, floor: PixelFloor, width: float, colour: str,
-    longest: float = math.inf,
+    longest: float,
 ) -> tuple[FloorSegment, ...]:
     """At most 16 straight strips among the blobs, those of most pixels first.
 
@@ -152,12 +152,8 @@ def floor_segments(
         beside = strip.beside(points)
         if _stands_free(points, strip, beside, width):
             taken = _one_tape(points, strip.along, strip.inside, longest)
-            run = strip.along[taken]
-            ends = strip.line.at(run.min()), strip.line.at(run.max())
-            segments.append(FloorSegment(
-                strip.line.normal, strip.line.offset, *ends, float(points.weight[taken].sum()),
-                upper_median(strip.line.footprint(points.spread[taken])),
-                segmentation.pixels[kept[taken]], colour, segmentation.pitch))
+            pixels = segmentation.pixels[kept[taken]]
+            segments.append(_segment(points, strip, taken, pixels, colour))
         else:
             # What is left of a solid must not pass for a thinner thing.
             taken = np.union1d(strip.inside, beside[free[beside]])
@@ -167,6 +163,21 @@ def floor_segments(
         starts -= fewer[1]
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
+
+
+def _segment(
+    points: FloorPoints, strip: _Strip, taken: NDArray[np.intp], pixels: Array, colour: str,
+) -> FloorSegment:
+    """What is told of a strip.
+
+    :param taken: those of the points that are its own (Q,).
+    :param pixels: theirs (Q, 2).
+    """
+    line, run = strip.line, strip.along[taken]
+    return FloorSegment(
+        line.normal, line.offset, line.at(run.min()), line.at(run.max()),
+        float(points.weight[taken].sum()), upper_median(line.footprint(points.spread[taken])),
+        pixels, colour, points.pitch)
 
 
 def widest_gap(longest: float, ends: float) -> float:

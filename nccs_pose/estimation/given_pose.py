@@ -18,54 +18,63 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from nccs_pose.estimation.motion import carried_on, Prediction, Track
+from nccs_pose.errors import EstimationError
+from nccs_pose.estimation.course import Course
+from nccs_pose.estimation.motion import Prediction, Track
 from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.geometry.pose import Array, Pose2
+import numpy as np
 
 
 class GivenPose:
     """Where the robot was said to be, carried on from image to image until one decides.
 
-    It was there at the first image that is asked about. The robot may drive on before any image
-    shows where: on a map that repeats itself a pose that stayed behind would decide for another
-    place.
+    The pose holds for the first image that is asked about. The robot may drive on before any
+    image shows where it is: on a map that repeats itself a pose that stayed behind would decide
+    for another place.
     """
 
     def __init__(self, pose: Pose2, covariance: Array) -> None:
         """Take a pose over.
 
         :param pose: T_map_base.
-        :param covariance: of (x, y, yaw) (3, 3).
+        :param covariance: of (x, y, yaw) (3, 3), positive definite.
+        :raises EstimationError: if the covariance is none.
         """
-        self._told = Prediction(pose, covariance, by_odometry=False, is_given=True)
-        self._track: Track | None = None
+        given = np.array(covariance, dtype=float)
+        if given.shape != (3, 3) or not np.isfinite(given).all() or (
+                np.linalg.eigvalsh(0.5 * (given + given.T))[0] <= 0.0):
+            raise EstimationError(
+                f'{given.tolist()} is no covariance of (x, y, yaw): 3 x 3, positive definite')
+        self._told = Prediction(pose, given, by_odometry=False, is_given=True)
+        self._course = Course()
         # How far the wheels had rolled when they were first heard.
         self._way: float | None = None
 
     @property
     def is_new(self) -> bool:
         """Whether no image has been asked about yet."""
-        return self._track is None
+        return self._course.last is None
 
-    def expected(self, stamp_ns: int, odometry: Wheels | None) -> Prediction | None:
+    def expected(self, stamp_ns: int, wheels: Wheels | None) -> Prediction | None:
         """Where the robot is at an image; None where it may be anywhere by now.
 
-        :param odometry: what the wheels say then; without, the robot may have driven at any speed.
+        :param wheels: what they say then; without, the robot may have driven at any speed.
         """
         expected: Prediction | None = self._told
-        if self._track is not None and self._track.stamp_ns != stamp_ns:
-            carried = carried_on((), self._track, odometry, stamp_ns)
+        last = self._course.last
+        if last is not None and last.stamp_ns != stamp_ns:
+            carried = self._course.at(stamp_ns, wheels)
             expected = None if carried is None else replace(carried, is_given=True)
         # Without wheels what it may have driven since counts from the first image without.
-        if expected is not None and (self._track is None or odometry is not None):
-            if self._way is None and odometry is not None:
-                self._way = odometry.way
+        if expected is not None and (last is None or wheels is not None):
+            if self._way is None and wheels is not None:
+                self._way = wheels.way
             self._told = expected
-            self._track = Track(
-                stamp_ns, expected.pose, expected.carried, odometry, stamp_ns, self._way)
+            self._course = Course(Track(
+                stamp_ns, expected.pose, expected.carried, wheels, stamp_ns, self._way))
         return expected
 
     def forget_odometry(self) -> None:
         """No step of the wheels leads on from what they told until now."""
-        if self._track is not None:
-            self._track = replace(self._track, odometry=None)
+        self._course = self._course.without_odometry()

@@ -30,12 +30,7 @@ from nccs_pose.estimation.general_lines import ALIGNED, all_minima
 from nccs_pose.estimation.global_minimum import global_minimum
 from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.local_minimum import minimum_near
-from nccs_pose.estimation.observability import (
-    Symmetry,
-    symmetry,
-    Unobserved,
-    unobserved_directions,
-)
+from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
@@ -67,7 +62,6 @@ class Solution:
     :ivar unobserved: directions that are not fixed, worst first, or that a central camera in the
         place of this one would not fix: what the little distance between the rays tells of them
         changes so fast along the way that the information at one pose is no measure of it.
-    :ivar symmetry: of the lines that have rays.
     """
 
     pose: Pose2
@@ -75,7 +69,6 @@ class Solution:
     information: Array
     covariance: Array | None
     unobserved: tuple[Unobserved, ...]
-    symmetry: Symmetry
 
 
 def solve(
@@ -100,8 +93,7 @@ def solve(
         no line's, or when every pose that fits has its lines behind the mirror.
     """
     data = LabelledRays(rays, directions, moments, label, sigma, sigma_world)
-    lines = symmetry(data.directions, data.moments).shifted(data.origin)
-    return tuple(_solution(data, entry, lines) for entry in _poses(data))
+    return tuple(_solution(data, entry) for entry in _poses(data))
 
 
 def best_pose(
@@ -230,7 +222,7 @@ def _difference(a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi)
 
 
-def _solution(data: LabelledRays, found: _Found, lines: Symmetry) -> Solution:
+def _solution(data: LabelledRays, found: _Found) -> Solution:
     x, y = (found.pose.x + data.origin[0], found.pose.y + data.origin[1])
     pose = Pose2(x, y, found.pose.yaw)
     unobserved = unobserved_directions(found.information, pose)
@@ -241,4 +233,4 @@ def _solution(data: LabelledRays, found: _Found, lines: Symmetry) -> Solution:
     covariance = None
     if not unobserved:
         covariance = inverse(found.information)
-    return Solution(pose, found.chi2, found.information, covariance, unobserved, lines)
+    return Solution(pose, found.chi2, found.information, covariance, unobserved)

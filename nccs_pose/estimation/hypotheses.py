@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.motion import SPEED
 from nccs_pose.estimation.odometry import Wheels
@@ -39,8 +40,8 @@ class Hypothesis:
 
     :ivar pose: T_map_base at the last image that was looked at.
     :ivar scores: its score in each image that it explained, 0 to 1.
-    :ivar apart: how far the robot may be from there by now, for all that wheels say of it, metres
-        and rad.
+    :ivar apart: how far the robot may be from there by now, metres and rad: by what the wheels
+        leapt since or, without wheels, by what it may have driven.
     """
 
     pose: Pose2
@@ -52,10 +53,15 @@ class Hypothesis:
         """Mean score."""
         return sum(self.scores) / len(self.scores)
 
+    @property
+    def candidate(self) -> Candidate:
+        """What is said of it to others."""
+        return Candidate(self.pose, self.mean)
+
 
 @dataclass(frozen=True, eq=False)
 class OpenPoses:
-    """The hypotheses that the last image which showed any left.
+    """The hypotheses that are left open, as of the last image that showed any of them.
 
     :ivar hypotheses: the best first; none where there is nothing to decide.
     :ivar stamp_ns: of that image.
@@ -71,7 +77,7 @@ class OpenPoses:
         return bool(self.hypotheses)
 
     def at(self, stamp_ns: int, odometry: Wheels | None) -> tuple[Hypothesis, ...]:
-        """Where they are at another image; without wheels somewhere near.
+        """Where they are by another image; without wheels still there, or somewhere near.
 
         :param odometry: what the wheels say then.
         """
@@ -89,13 +95,11 @@ class OpenPoses:
 def confronted(
     hypotheses: Sequence[Hypothesis], held: Sequence[tuple[Pose2, float]],
 ) -> tuple[Hypothesis, ...]:
-    """The hypotheses after an image, best first: those that it shows, in their new place.
+    """The hypotheses after an image, best first: the poses that it shows, each with its scores.
 
-    :param held: every pose that explains the image, with its score; without any the image
-        decides nothing.
+    :param hypotheses: those before it, in their new place.
+    :param held: every pose that explains the image, with its score.
     """
-    if not held:
-        return tuple(hypotheses)
     found = []
     for pose, score in held:
         before = max(

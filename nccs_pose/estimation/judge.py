@@ -141,7 +141,7 @@ class Judge:
     def found(
         self, image: NDArray[np.uint8], alignment: Alignment,
         segments: tuple[FloorSegment, ...], history: LineHistory, *, expected: bool,
-        strips: FittedCandidate | None = None,
+        strips: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose by the whole image.
 
@@ -165,7 +165,7 @@ class Judge:
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
-        strips: FittedCandidate | None = None,
+        strips: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose against which the image itself says nothing; see :meth:`found`."""
         against = contradiction(alignment, segments, self._map)

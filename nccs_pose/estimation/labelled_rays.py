@@ -55,8 +55,8 @@ class LabelledRays:
         directions: ArrayLike,
         moments: ArrayLike,
         label: ArrayLike,
-        sigma: ArrayLike = 1.0,
-        sigma_world: float = 0.0,
+        sigma: ArrayLike,
+        sigma_world: float,
     ) -> None:
         """See :func:`nccs_pose.estimation.global_pose.solve` for parameters and errors."""
         lines = _checked_lines(directions, moments)
@@ -92,11 +92,6 @@ class LabelledRays:
     def directions(self) -> Array:
         """Unit directions of the lines (L, 3)."""
         return self.lines[:, :3]
-
-    @property
-    def moments(self) -> Array:
-        """Moments of the lines about the origin (L, 3), metres."""
-        return self.lines[:, 3:]
 
     @property
     def rows(self) -> Array:

@@ -133,12 +133,12 @@ class Ledger:
             [f for f in self._held if f.score >= self._ratio * self.best.score]) > 1
 
     def beats(self, strips: FittedCandidate) -> bool:
-        """Whether what strips show of a pose leaves it no chance against the best that holds.
+        """Whether a pose, by what strips show of it, has no chance against the best that holds.
 
-        No pose scores more on the image than the root of what it scores on the strips, times
-        what is left of that by how far they lie off its lines; and where the strips show all that
-        the pose that holds expects, and nothing else, they tell rivals as well as the image: but
-        for one that leaves no strip unexplained, of which more may be there than the strips show.
+        On the image no pose scores more than the square root of what it scores by strips, times
+        what is left of that by how far these lie off its lines. And where the best pose explains
+        nearly all, the strips alone tell its rivals from it; but for a rival that leaves no strip
+        unexplained, since more of its lines may be in the image than the strips show.
         """
         best, ratio = self.best, self._ratio
         if best is None:
@@ -163,13 +163,13 @@ class Ledger:
         self._hidden.append(Candidate(strips.pose, strips.score))
 
     def begin(self, pose: Pose2) -> None:
-        """Note from where a pose was laid on the image: from its twins one comes to twins."""
+        """Note where a pose starts from; from a twin of that it would come to a twin of itself."""
         self._settle_twins(pose)
 
     def hold(self, found: Found, strips: FittedCandidate | None) -> list[Pose2]:
         """Note a pose that holds.
 
-        :param strips: what they said of where it was begun from, if they did.
+        :param strips: what these say of the pose that it started from; None if nothing.
         :returns: those of its twins that have to be laid on the image too.
         """
         self._laid.append(found.alignment.pose)
@@ -236,7 +236,7 @@ class Ledger:
 
         :param known: those that hold; what is left open is added.
         """
-        # What explains nearly all, and more than the best does, leaves that in doubt.
+        # A pose that explains nearly all, and more than the best does, leaves the best in doubt.
         found = [Candidate(excused.alignment.pose, best.score)
                  for excused in self._excused
                  if explains_nearly_all(excused) and excused.score > best.score]

@@ -25,8 +25,8 @@ from nccs_pose.estimation.verdict import lines_used
 WEAK = 0.5
 """A line of which a pose rests on less than this part is looked for beside its place."""
 BEYOND_DOUBT = 4
-"""What was once seen beside its place is believed to be so until it is seen in it; or the pose
-rests on so many other lines that one of them would show."""
+"""A line that was once seen beside its place is doubted until it is seen in it, or the pose rests
+on so many other lines that any of them that was elsewhere would show."""
 # Thinner than this, px, a line is drowned by compression, and what is left of the floor around it
 # looks like it.
 _SURE_WIDTH = 0.5
@@ -60,7 +60,8 @@ class LineHistory:
     def after(self, alignment: Alignment, *, searched: bool) -> LineHistory:
         """After an image that gave a pose.
 
-        Another place, another doubt: a line out of view is no longer doubted.
+        A line that is seen in its place is doubted no longer; nor is one out of view, since what
+        looked like it belongs to another place.
 
         :param searched: whether the whole image was searched for it.
         """

@@ -26,30 +26,27 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 
-from nccs_pose.errors import EstimationError, FrameRefusedError, GeometryError
+from nccs_pose.errors import FrameRefusedError, GeometryError
+from nccs_pose.estimation import answers
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import OPEN
 from nccs_pose.estimation.case import Case
+from nccs_pose.estimation.coasting import may_coast, shows_another_place
+from nccs_pose.estimation.course import Course
 from nccs_pose.estimation.decision import left_open, may_show, the_one_expected
-from nccs_pose.estimation.estimate import (
-    Candidate,
-    Doubted,
-    Estimate,
-    Quality,
-    State,
-)
-from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.following import Follower
+from nccs_pose.estimation.frame import Frame
 from nccs_pose.estimation.given_pose import GivenPose
-from nccs_pose.estimation.hypotheses import ambiguity, LEAST_IMAGES, OpenPoses
+from nccs_pose.estimation.hypotheses import ambiguity, Hypothesis, LEAST_IMAGES, OpenPoses
 from nccs_pose.estimation.judge import Found, Judge
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.many_poses import same_pose
-from nccs_pose.estimation.motion import carried_on, PAST, Prediction, Track
-from nccs_pose.estimation.observability import Unobserved, unobserved_directions
-from nccs_pose.estimation.odometry import Odometry, Wheels
+from nccs_pose.estimation.motion import Prediction
+from nccs_pose.estimation.observability import unobserved_directions
+from nccs_pose.estimation.odometry import Odometry
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.rivals import Rivals
 from nccs_pose.estimation.search import Searcher
@@ -68,14 +65,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DEFAULTS = LocaliserOptions()
-# Odometry carries a pose on only while it explains this part of what looks like a line, if that is
-# more than so many pixels for each of the image's width.
-_CLAIMED = 0.5
-_FOREIGN = 0.25
-# What is expected is forgotten when images have shown other places for so long, ns.
+# What was expected is forgotten when images have shown other places for so long, ns.
 _REFUTED_NS = 500_000_000
 # A pose given by hand or from the last run decides among those within so many deviations.
 _PRIOR_GATE = 4.0
+# Where too little is in view to find a pose, one that was given is believed if it explains this
+# part of the strips.
+_LEAST_CLAIMED = 0.5
+_FOUND = 'found by searching the whole image'
 
 
 class Localiser:
@@ -140,8 +137,7 @@ class Localiser:
 
         How blurred the images are is remembered: the lens stays the same.
         """
-        self._track: Track | None = None
-        self._past: tuple[Track, ...] = ()
+        self._course = Course()
         self._given: GivenPose | None = None
         self._ever_tracked = False
         # Whether an image has shown another place than expected since the last pose.
@@ -149,8 +145,6 @@ class Localiser:
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
-        # What the wheels say at the image in hand.
-        self._now: Wheels | None = None
         # Poses among which no image has decided yet.
         self._open = OpenPoses()
         # Since when images have shown nothing where it was expected.
@@ -170,13 +164,9 @@ class Localiser:
         :param covariance: of (x, y, yaw) (3, 3), positive definite.
         :raises EstimationError: if the covariance is none; everything stays as it was.
         """
-        given = np.array(covariance, dtype=float)
-        if given.shape != (3, 3) or not np.isfinite(given).all() or (
-                np.linalg.eigvalsh(0.5 * (given + given.T))[0] <= 0.0):
-            raise EstimationError(
-                f'{given.tolist()} is no covariance of (x, y, yaw): 3 x 3, positive definite')
+        given = GivenPose(pose, covariance)
         self.relocalise()
-        self._given = GivenPose(pose, given)
+        self._given = given
 
     def add_odometry(self, stamp_ns: int, pose: Pose2) -> None:
         """Take a sample of wheel odometry, T_odom_base.
@@ -189,8 +179,7 @@ class Localiser:
             self._open = replace(self._open, odometry=None)
             if self._given is not None:
                 self._given.forget_odometry()
-            if self._track is not None:
-                self._track = replace(self._track, odometry=None)
+            self._course = self._course.without_odometry()
             raise
 
     @property
@@ -209,216 +198,167 @@ class Localiser:
             given = self._given if self._given is not None and self._given.is_new else None
             self._odometry.clear()
             self.relocalise()
-            # Said since the last image, it is of the time that begins.
+            # One that was given since the last image belongs to the time that begins.
             self._given = given
         watch = Stopwatch()
-        self._now = self._odometry.at(stamp_ns)
-        prediction = None if self._track is None else carried_on(
-            self._past, self._track, self._now, stamp_ns)
+        wheels = self._odometry.at(stamp_ns)
+        prediction = self._course.at(stamp_ns, wheels)
+        frame = Frame(stamp_ns, image, wheels, prediction, watch)
         watch.lap('predict')
         if prediction is None:
-            return self._search(stamp_ns, image, None, Refused(), watch)
+            return self._search(frame, Refused())
         followed = self._follower.follow(image, prediction, self._colours, self._history, watch)
         if isinstance(followed, Found):
             return self._tracking(
-                stamp_ns, followed, prediction, watch, 'the pose explains the image')
-        return self._search(stamp_ns, image, prediction, followed, watch)
+                frame, followed, 'the pose explains the image', prior=prediction)
+        return self._search(frame, followed)
 
-    def _search(
-        self, stamp_ns: int, image: NDArray[np.uint8], prediction: Prediction | None,
-        refused: Refused, watch: Stopwatch,
-    ) -> Estimate:
-        """Look for every pose that explains the image, and take the one that is left, if any."""
-        hypotheses = self._open.at(stamp_ns, self._now)
-        given = None if self._given is None else self._given.expected(stamp_ns, self._now)
-        told = self._told(given, prediction)
-        looks: dict[Sight, Sifted] = {}
-        for sight in sights(
-                image, self._searcher, self._fresh_colours(), self._in_vain, told, watch.lap):
-            segments = sight.segments
-            # Another try of the same would come to the same.
-            if sight not in looks:
-                looks[sight] = self._sifter.sift(
-                    Case(sight, self._history, prediction, told, looks), hypotheses)
-            sifted = looks[sight]
-            watch.lap('measure')
-            # What was tried early is no place to be alone in.
-            if sifted.held and (
-                    sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
-                break
+    def _search(self, frame: Frame, refused: Refused) -> Estimate:
+        """Look for every pose that explains the image, and take the one that is left, if any.
+
+        :param refused: what came of following the robot to the image.
+        """
+        given = None if self._given is None else self._given.expected(
+            frame.stamp_ns, frame.wheels)
+        told = self._told(given or frame.prediction)
+        hypotheses = self._open.at(frame.stamp_ns, frame.wheels)
+        looks, last = self._looks(frame, told, hypotheses)
+        sifted = looks[last]
         held = sifted.held
         self._in_vain = 0 if held else self._in_vain + 1
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
-            here = self._judge.measured(refused.alignment, segments).score
+            here = self._judge.measured(refused.alignment, last.segments).score
             held = [f for f in held if f.score > here or same_pose(
                 f.alignment.pose, refused.alignment.pose)]
         if not held:
-            trusted = None if given is None else self._trusted(image, given, segments, watch)
+            trusted = None if given is None else self._trusted(frame, given, last)
             if trusted is not None:
                 return self._tracking(
-                    stamp_ns, trusted, given, watch,
-                    'the image agrees with the pose that was given')
+                    frame, trusted, 'the image agrees with the pose that was given', prior=given)
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
-            return self._without_pose(stamp_ns, prediction, segments, refused, watch)
-        chosen = the_one_expected(held, sifted, told, prediction, self._options)
+            return self._without_pose(frame, last, refused)
+        chosen = the_one_expected(held, sifted, told, frame.prediction, self._options)
         if chosen is not None:
-            words = 'found by searching the whole image'
-            if len(held) > 1:
-                words = 'several poses explain the image; the one expected was taken'
-            return self._tracking(stamp_ns, chosen, None, watch, words, held)
-        first = prediction is None and not self._open
-        hypotheses, more = left_open(hypotheses, held, sifted)
-        self._open = OpenPoses(hypotheses, stamp_ns, self._now)
+            words = _FOUND if len(held) == 1 else (
+                'several poses explain the image; the one expected was taken')
+            return self._tracking(frame, chosen, words, held=held)
+        return self._decided(frame, held, sifted, told, hypotheses)
+
+    def _decided(
+        self, frame: Frame, held: list[Found], sifted: Sifted, told: Told | None,
+        before: Sequence[Hypothesis],
+    ) -> Estimate:
+        """Decide between poses by all images since they were first seen, or leave them open.
+
+        :param held: those that explain this image, best first.
+        :param sifted: what else the search of it left.
+        :param before: those that the images before left open, where they are by now.
+        """
+        first = frame.prediction is None and not self._open
+        hypotheses, more = left_open(before, held, sifted)
+        self._open = OpenPoses(hypotheses, frame.stamp_ns, frame.wheels)
         best = hypotheses[0]
         if ambiguity(hypotheses) <= self._options.ambiguity_ratio and (
                 first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
-            return self._tracking(
-                stamp_ns, found, None, watch, 'found by searching the whole image', held)
+            return self._tracking(frame, found, _FOUND, held=held)
         if told is not None and not may_show(told, held, sifted):
             # Carried on for long, what was expected would agree with one of them by chance.
             if self._refuted_ns is None:
-                self._refuted_ns = stamp_ns
-            elif stamp_ns - self._refuted_ns >= _REFUTED_NS:
-                self._track, self._past, self._given = None, (), None
-        return self._undecided(stamp_ns, held, more, watch)
+                self._refuted_ns = frame.stamp_ns
+            elif frame.stamp_ns - self._refuted_ns >= _REFUTED_NS:
+                self._course, self._given = Course(), None
+        return answers.undecided(frame, held[0], hypotheses, more, self._options, self._unknown)
 
-    def _trusted(
-        self, image: NDArray[np.uint8], given: Prediction, segments: tuple[FloorSegment, ...],
-        watch: Stopwatch,
-    ) -> Found | None:
+    def _looks(
+        self, frame: Frame, told: Told | None, hypotheses: tuple[Hypothesis, ...],
+    ) -> tuple[dict[Sight, Sifted], Sight]:
+        """Look at an image in one way after the other, until one shows a pose.
+
+        :returns: what came of each sight, in order, and the one to go by.
+        """
+        looks: dict[Sight, Sifted] = {}
+        for sight in sights(frame.image, self._searcher, self._fresh_colours(), self._in_vain,
+                            told, frame.watch.lap):
+            # One that comes again would come to the same.
+            if sight not in looks:
+                looks[sight] = self._sifter.sift(
+                    Case(sight, self._history, frame.prediction, told, looks), hypotheses)
+            sifted = looks[sight]
+            frame.watch.lap('measure')
+            # On a sight that came early, though it promises little, one pose alone proves nothing.
+            if sifted.held and (
+                    sight.is_promising or len(sifted.held) + len(sifted.open) > 1):
+                break
+        return looks, sight
+
+    def _told(self, expected: Prediction | None) -> Told | None:
+        """Where a pose that was given, or the prediction, says that the robot is."""
+        if expected is None:
+            return None
+        if expected.is_given:
+            return Told(expected.pose, expected.carried, _PRIOR_GATE)
+        return Told(expected.pose, expected.covariance, self._options.innovation_gate)
+
+    def _trusted(self, frame: Frame, given: Prediction, sight: Sight) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""
-        followed = self._follower.follow(image, given, self._colours, self._history, watch)
+        followed = self._follower.follow(
+            frame.image, given, self._colours, self._history, frame.watch)
         if not isinstance(followed, Found):
             return None
-        _, claimed = self._searcher.score(followed.alignment.pose, segments)
-        return replace(followed, claimed=claimed) if claimed >= _CLAIMED else None
-
-    def _told(self, given: Prediction | None, prediction: Prediction | None) -> Told | None:
-        """Where a pose that was given or the prediction says that the robot is."""
-        if given is not None:
-            return Told(given.pose, given.carried, _PRIOR_GATE)
-        if prediction is not None:
-            return Told(prediction.pose, prediction.covariance, self._options.innovation_gate)
-        return None
+        _, claimed = self._searcher.score(followed.alignment.pose, sight.segments)
+        return replace(followed, claimed=claimed) if claimed >= _LEAST_CLAIMED else None
 
     def _tracking(
-        self, stamp_ns: int, found: Found, prior: Prediction | None, watch: Stopwatch,
-        reason: str, held: list[Found] | None = None,
+        self, frame: Frame, found: Found, reason: str, *, prior: Prediction | None = None,
+        held: Sequence[Found] = (),
     ) -> Estimate:
         """Take a pose over.
 
-        :param prior: the prediction that was weighed in with it, if one was.
-        :param held: all poses that explain the image, best first, if it was searched.
+        :param prior: the prediction that was weighed in with it; None if it was searched.
+        :param held: if it was searched, all poses that explain the image, best first.
         """
         alignment, covariance = found.alignment, found.alignment.covariance
         if prior is not None:
             covariance = prior.without_floor(covariance, alignment.refinement.covariance)
-        unobserved = unobserved_directions(
-            alignment.refinement.information, alignment.pose, limit=OPEN)
-        seen_ns, seen_way = stamp_ns, None if self._now is None else self._now.way
         # Whoever is told of it shares it with the track.
         covariance.setflags(write=False)
-        last = self._track
-        if unobserved and last is not None:
-            seen_ns, seen_way = last.seen_ns, last.seen_way
-        # No velocity leads across a jump, nor to where an image sets right what those before it
-        # had left open.
-        set_right = last is not None and last.seen_ns < last.stamp_ns and not unobserved
-        self._past = () if self._open or last is None or set_right else (
-            *self._past, last)[-PAST:]
-        self._track = Track(
-            stamp_ns, alignment.pose, covariance, self._now, seen_ns, seen_way)
+        unobserved = unobserved_directions(
+            alignment.refinement.information, alignment.pose, limit=OPEN)
+        self._course = self._course.after(
+            frame.stamp_ns, alignment.pose, covariance, frame.wheels,
+            is_fixed=not unobserved, is_jump=bool(self._open))
         self._colours = alignment.colours
-        self._given = None
-        self._refuted_ns = None
-        self._shaken = False
-        if held is not None:
-            self._follower.begin()
-        self._open = OpenPoses()
         self._history = self._history.after(alignment, searched=prior is None)
-        self._ever_tracked = True
-        ranked = held or [found]
-        quality = _quality(
-            found, ranked[1].score / ranked[0].score if len(ranked) > 1 else 0.0, unobserved)
-        watch.lap('refine')
-        return Estimate(
-            stamp_ns, State.TRACKING, reason, alignment.pose, covariance,
-            tuple(Candidate(f.alignment.pose, f.score) for f in ranked), alignment.points,
-            quality, watch.times)
+        if prior is None:
+            self._follower.begin()
+        self._open, self._given, self._refuted_ns = OpenPoses(), None, None
+        self._shaken, self._ever_tracked = False, True
+        return answers.tracking(frame, reason, held or [found], found, covariance, unobserved)
 
-    def _undecided(
-        self, stamp_ns: int, held: list[Found], more: list[Candidate], watch: Stopwatch,
-    ) -> Estimate:
-        """Say which poses may be right, and give none of them.
-
-        :param more: that are not carried on.
-        """
-        hypotheses = self._open.hypotheses
-        poses = tuple(sorted(
-            (*(Candidate(h.pose, h.mean) for h in hypotheses), *more), key=lambda c: -c.score))
-        ratio = ambiguity(hypotheses)
-        quality = _quality(held[0], ratio)
-        if ratio > self._options.ambiguity_ratio:
-            state, words = State.AMBIGUOUS, (
-                f'{len(poses)} poses explain the image about equally well (the second scores '
-                f'{ratio:.2f} of the first)')
-        else:
-            state = State.LOST if self._ever_tracked else State.SEARCHING
-            words = 'the image shows another place than expected; the next one has to agree'
-        return Estimate(
-            stamp_ns, state, words, candidates=poses, quality=quality, times=watch.times)
-
-    def _without_pose(
-        self, stamp_ns: int, prediction: Prediction | None, segments: tuple[FloorSegment, ...],
-        refused: Refused, watch: Stopwatch,
-    ) -> Estimate:
+    def _without_pose(self, frame: Frame, sight: Sight, refused: Refused) -> Estimate:
         """Coast on odometry where that still says something; else say what is missing."""
-        against, doubted, track = refused.objection, None, self._track
-        missing = against.words if against is not None else what_is_missing(segments)
+        against, prediction = refused.objection, frame.prediction
         contradicted = False
         if against is not None and against.line is not None:
             contradicted = self._history.contradicts(against.line)
             self._history = self._history.doubting(against.line)
-        if refused.alignment is not None:
-            doubted = Doubted(refused.alignment.pose, refused.alignment.points)
         if prediction is not None:
-            self._shaken |= (
-                contradicted or bool(self._open) or self._shows_another(prediction, segments))
-        if track is not None and prediction is not None and (
-                prediction.by_odometry and not self._shaken):
-            age = (stamp_ns - track.stamp_ns) * 1e-9
-            covariance = prediction.covariance
-            variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), covariance[2, 2])
-            if age <= self._options.coast_time and variance <= self._options.coast_sigma ** 2:
-                return Estimate(
-                    stamp_ns, State.COASTING,
-                    f'carried on by odometry for {age:.2f} s: {missing}', prediction.pose,
-                    prediction.carried, doubted=doubted, times=watch.times)
-        state = State.LOST if self._ever_tracked else State.SEARCHING
-        hypotheses = self._open.at(stamp_ns, self._now)
-        return Estimate(
-            stamp_ns, state, missing, times=watch.times, doubted=doubted,
-            candidates=tuple(Candidate(h.pose, h.mean) for h in hypotheses))
+            self._shaken |= contradicted or bool(self._open) or shows_another_place(
+                sight, prediction, self._searcher)
+        missing = what_is_missing(sight.segments) if against is None else against.words
+        doubted = None if refused.alignment is None else Doubted(
+            refused.alignment.pose, refused.alignment.points)
+        if prediction is not None and not self._shaken:
+            seconds = self._course.seconds_to(frame.stamp_ns)
+            if may_coast(prediction, seconds, self._options):
+                return answers.coasting(frame, prediction, seconds, missing, doubted)
+        return answers.without_pose(
+            frame, self._unknown, missing, self._open.at(frame.stamp_ns, frame.wheels), doubted)
 
-    def _shows_another(
-        self, prediction: Prediction, segments: tuple[FloorSegment, ...],
-    ) -> bool:
-        """Whether an image shows another place than expected."""
-        if self._open:
-            return True
-        _, claimed = self._searcher.score(prediction.pose, segments)
-        foreign = (1.0 - claimed) * sum(strip.weight for strip in segments)
-        return claimed < _CLAIMED and foreign > _FOREIGN * self._table.rig.camera.width
-
-
-def _quality(found: Found, ambiguity: float, unobserved: Sequence[Unobserved] = ()) -> Quality:
-    """The signals of health of a pose."""
-    alignment = found.alignment
-    return Quality(
-        lines_used=len(alignment.lines), points_used=len(alignment.points),
-        residual_px=alignment.residual_px, expected_px=alignment.expected_px,
-        explained=alignment.explained, claimed=found.claimed, ambiguity=ambiguity,
-        unobserved=tuple(u.words for u in unobserved))
+    @property
+    def _unknown(self) -> State:
+        """The state without any pose."""
+        return State.LOST if self._ever_tracked else State.SEARCHING

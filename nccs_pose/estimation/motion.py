@@ -35,13 +35,13 @@ _FLOOR_SIGMA = (0.02, 0.015)
 # What wheels gain in error over the first metre or radian; it grows with the square root.
 _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
-# Besides, they are taken for larger or smaller than they are by this part.
+# Besides, they may be larger or smaller than they are taken for, by this part.
 _SCALE = 0.02
-# Without odometry: the speed and the acceleration that may have been, m/s and rad/s, a second.
+# Without odometry: the speed and the acceleration that a robot may have, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
 # A prediction less sure than this, m and rad, leaves room for more than one place that looks the
-# same: of cells of half a metre it may be halfway to the next after 2.5 deviations.
+# same: on a map of half-metre cells 2.5 deviations are halfway to the next.
 _SURE = (0.1, 0.2)
 # A change of velocity goes on if it is larger than so many deviations of what is known of it.
 _CERTAIN = 2.0
@@ -74,7 +74,7 @@ class Prediction:
     """A pose expected before its image is looked at.
 
     :ivar pose: T_map_base.
-    :ivar carried: covariance of (x, y, yaw) (3, 3), by what moved it.
+    :ivar carried: covariance of (x, y, yaw) (3, 3): of the pose it comes from, and of the way.
     :ivar by_odometry: whether wheels say so, or only the last velocity.
     :ivar is_given: whether it goes back to what somebody said, and not to an image.
     """
@@ -86,7 +86,7 @@ class Prediction:
 
     @cached_property
     def covariance(self) -> Array:
-        """What the image is held against (3, 3): never so narrow that it would rule the image."""
+        """What the image is weighed against: never so narrow that it would overrule the image."""
         return self.carried + FLOOR
 
     @cached_property
@@ -119,28 +119,15 @@ class Prediction:
 FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])
 
 
-def carried_on(
-    past: Sequence[Track], last: Track, now: Wheels | None, stamp_ns: int,
-) -> Prediction | None:
-    """Carry a pose on to a stamp by the wheels, or where they are silent by its velocity.
-
-    :param past: the poses before the last one, in order.
-    :param now: what the wheels say at the stamp; None without odometry.
-    """
-    if last.odometry is not None and now is not None:
-        return by_odometry(last.pose, last.covariance, last.odometry, now, last.seen_way)
-    return by_velocity(past, last, stamp_ns)
-
-
 def by_odometry(
     pose: Pose2, covariance: Array, before: Wheels, after: Wheels,
     seen_way: float | None = None,
 ) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two moments.
 
-    They err by the whole of their way, also where it leads back: by chance, whose squares add up,
-    and by their size, whose errors do. What they leapt may be no way at all,
-    and lead all of the way astray.
+    They err by the whole of their way, also where it leads back: by chance, which adds up in
+    squares, and by their size, which adds up as it is. A leap of theirs may be no motion at all:
+    it counts in full, and its turn swings all of the way.
 
     :param seen_way: how far they had rolled when the pose was last fixed in every direction,
         metres; None for when they were asked first.

@@ -64,7 +64,6 @@ class PaperEstimate:
     :ivar pose: T_map_base.
     :ivar theta: turn from the world to the camera frame, radians (the paper's R, eq. 15).
     :ivar translation: (t_x, t_y, t_z) from the world to the camera frame, metres (the paper's t).
-    :ivar objective: mean |gamma_r|, of its value at the start.
     :ivar g1: c^2 + s^2 - 1 where it ended.
     :ivar g2: mean (x - P / Q)^2 where it ended, square metres.
     :ivar iterations: of SLSQP.
@@ -75,7 +74,6 @@ class PaperEstimate:
     pose: Pose2
     theta: float
     translation: Array
-    objective: float
     g1: float
     g2: float
     iterations: int
@@ -292,7 +290,7 @@ def _solve(problem: PaperProblem, start: Pose2, use_g2: bool) -> PaperEstimate:
     c, s, t_x, t_y = found
     return PaperEstimate(
         problem.frame.pose(found), math.atan2(s, c), np.array([t_x, t_y, problem.frame.t_z]),
-        float(objective(found)[0]), _g1(found), problem.g2(found)[0],
+        _g1(found), problem.g2(found)[0],
         int(result.nit), bool(result.success), str(result.message))
 
 

@@ -134,10 +134,3 @@ def monomials_and_slopes(x: float, y: float, yaw: float) -> Array:
     return np.array([
         [c, s, x, y, p, q, 1.0], [0.0, 0.0, 1.0, 0.0, c, -s, 0.0],
         [0.0, 0.0, 0.0, 1.0, s, c, 0.0], [-s, c, 0.0, 0.0, q, -p, 0.0]])
-
-
-def feet_in_plan(directions: Array, moments: Array) -> Array:
-    """Points d x mu of lines (L, 3) nearest to the origin, without their height, (L, 2)."""
-    dx, dy, dz = directions.T
-    mx, my, mz = moments.T
-    return np.array([dy * mz - dz * my, dz * mx - dx * mz]).T

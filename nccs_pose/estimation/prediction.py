@@ -51,7 +51,7 @@ _LEVEL = np.zeros(3)
 class Places:
     """Where on the floor tapes N stations stand.
 
-    :ivar number: of the line among the floor tapes (N,).
+    :ivar number: of the line in the map (N,).
     :ivar distance: from the line's start (N,), metres.
     :ivar spacing: length of curve that the station stands for (N,), px.
     :ivar members: of each group of neighbours, one after the other; every line has whole groups.
@@ -78,36 +78,34 @@ class Places:
 
 
 class BandPredictor:
-    """Lays stations along the images of a map's floor tapes, for one rig."""
+    """Lays stations along the images of a map's lines, which are all tapes, for one rig."""
 
     def __init__(self, table: FloorTable, line_map: LineMap) -> None:
         self._table = table
-        self._lines = np.array(
-            [k for k, line in enumerate(line_map) if line.is_tape], dtype=np.intp)
-        self._start = as_complex(line_map.starts[self._lines, :2])
-        self._direction = as_complex(line_map.directions[self._lines, :2])
-        self._length = line_map.lengths[self._lines]
-        self._half_width = 0.5 * line_map.widths[self._lines]
+        self._start = as_complex(line_map.starts[:, :2])
+        self._direction = as_complex(line_map.directions[:, :2])
+        self._length = line_map.lengths
+        self._half_width = 0.5 * line_map.widths
         parts = np.maximum(_GAPS, np.ceil(self._length / _LONGEST_PART)).astype(np.intp)
         # Half width, half its square, length, parts per metre, the first of them and direction to
         # the left, by rows.
         self._tapes = np.array([
             self._half_width, 0.5 * self._half_width**2, self._length, parts / self._length,
             parts.cumsum() - parts, -self._direction.imag, self._direction.real])
-        self._slope = _SLOPE * np.arange(_COARSE * len(self._lines))
-        self._gap = self._gaps(parts, first_pieces(line_map)[self._lines])
+        self._slope = _SLOPE * np.arange(_COARSE * len(line_map))
+        self._gap = self._gaps(parts, first_pieces(line_map))
 
     def places(
         self, pose: Pose2, spacing: float, most: int, lines: Collection[int] | None = None,
     ) -> Places:
-        """Stations evenly spaced in the image along each visible floor tape.
+        """Stations evenly spaced in the image along each visible tape.
 
         :param pose: T_map_base.
         :param spacing: of the stations, px, or more.
         :param most: at most so many a line.
         :param lines: of the map that get any; None for all.
         """
-        tapes = len(self._lines)
+        tapes = len(self._length)
         turn = _turned_back(pose)
         along = self._in_reach((self._start - complex(pose.x, pose.y)) * turn, turn)
         samples = self._start[:, None] + along * self._direction[:, None]
@@ -126,7 +124,7 @@ class BandPredictor:
         limit = min(most, _MOST // max(tapes, 1))
         count = [min(limit, int(each / spacing)) for each in length]
         if lines is not None:
-            count = [n if k in lines else 0 for k, n in zip(self._lines.tolist(), count)]
+            count = [n if k in lines else 0 for k, n in enumerate(count)]
         # All groups are equal, so that what is summed over them needs no list of their sizes.
         shown = max(sum(each for each, n in zip(length, count) if n), spacing)
         members = max(round(_SHARED_PX * sum(count) / shown), 1)
@@ -188,18 +186,8 @@ class BandPredictor:
         keep = (self._table.sees_floor(centre) & (half_width > 1e-3) & (gap * gain > _BESIDE)
                 & (np.minimum(distance, length - distance) > half * np.abs(lean)))
         bands = Bands(centre, as_points(pixels), as_points(across), bend, half_width,
-                      places.spacing, self._lines.take(number), places.members)
-        # A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it
-        # along its line does not count.
-        slide = np.empty((6, len(number)))
-        against = -gain
-        np.multiply(against, left, out=slide[:2])
-        np.multiply(against, (back * middle).real, out=slide[2])
-        # Floor that sinks by dz is seen where the ray would have met it, further out.
-        sinking = against * (back * image.falls).imag
-        slide[3] = sinking
-        np.multiply(sinking, middle.imag, out=slide[4])
-        np.multiply(-sinking, middle.real, out=slide[5])
+                      places.spacing, number, places.members)
+        slide = _slide(gain, left, middle, back, image.falls)
         if np.count_nonzero(keep) == len(keep):
             return bands, slide.T
         # The groups of each line are made whole again.
@@ -241,6 +229,30 @@ class BandPredictor:
             gap[whole.take(tape) == whole[k]] = np.inf
             np.minimum(gaps, gap, out=gaps)
         return gaps - self._half_width.take(tape)
+
+
+def _slide(gain: Array, left: Array, middle: Complex, back: Complex, falls: Complex) -> Array:
+    """d(place of stations across their curves)/d(x, y, yaw, z, roll, pitch), (6, N).
+
+    A point of the map moves in base_link by -R^T dt, and by (y, -x) dyaw; what moves it along its
+    line does not count.
+
+    :param gain: px across the curve by metres across the line (N,).
+    :param left: direction across the line in the map, to its left (2, N).
+    :param middle: the stations in base_link, x + iy (N,), metres.
+    :param back: the line's direction in base_link, conjugate (N,).
+    :param falls: how far out floor is seen that has sunk, per metre of that (N,).
+    """
+    slide = np.empty((6, len(gain)))
+    against = -gain
+    np.multiply(against, left, out=slide[:2])
+    np.multiply(against, (back * middle).real, out=slide[2])
+    # Floor that sinks by dz is seen where the ray would have met it, further out.
+    sinking = against * (back * falls).imag
+    slide[3] = sinking
+    np.multiply(sinking, middle.imag, out=slide[4])
+    np.multiply(-sinking, middle.real, out=slide[5])
+    return slide
 
 
 def _turned_back(pose: Pose2) -> complex:

@@ -71,16 +71,19 @@ class Rivals:
         self._options = options
 
     def doubt(self, case: Case, found: Found, *, has_refused: bool) -> Objection | None:
-        """Why a pose that nothing expects may be another; None if it stands alone.
+        """Why a pose that nothing predicted may be the wrong one; None if nothing is as good.
 
-        On an image so coarse that lines lie badly on it how well they lie says little, and what a
-        pose shows of strips and lines has to stand out among those that lie on it, and where the
-        map looks nearly the same. Nor need the right one be among these, since strips lie askew: a
-        pose has to show all the lines that should be in view. Too little may show the right one to
-        lay it on the image, so a rival by strips is enough; but one that explains nearly all,
-        which leaves little to stand out by, is in doubt only where another shows as much, or lies
-        as well. Two lines lie well on any corner, even on a sharp image; on a coarse one, on what
-        is no corner too. Where the image decides nothing there is no doubt.
+        On a sharp image three lines or more lie well on the right pose alone. Two lie well on any
+        corner: no rival may show as much of the strips.
+
+        On a coarse image lines lie badly on any pose, and how badly says little. Two lines then
+        say nothing. Of a pose on three or more, all lines that should be in view have to be
+        there, as the right pose may not have been tried: strips lie askew. And no other candidate
+        may show as much by strips alone; only of a pose that explains nearly all, which leaves
+        little to stand out by, they must show as much laid on the image as well. So must, in
+        either case, places from where the map looks nearly the same.
+
+        Where many places show as much, the image decides nothing, and there is no doubt to raise.
 
         :param has_refused: whether a pose that lies on the image was refused.
         """

@@ -32,11 +32,12 @@ from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 
-# Where nothing tells where to look, an image shows no pose after so many of them in vain: of seven
-# hundred first images that showed one all did at one of these.
+# Where nothing is told of the pose, the search of an image ends after so many candidates that do
+# not hold: in all of seven hundred first images that showed a pose it was one of these.
 _IN_VAIN = 4
-# Only those count that score this fraction of the best, or are where the robot should be: one that
-# holds is the best by strips or nearly so (0.93 of its score or more, of a thousand that held).
+# Only candidates that score this fraction of the best, or are where the robot should be, are laid
+# on the image: one that holds is the best by strips or nearly so (a thousand that held had 0.93 of
+# its score or more).
 _WORTH_TRYING = 0.75
 
 

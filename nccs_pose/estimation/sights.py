@@ -86,17 +86,18 @@ def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
     told: Told | None, lap: Callable[[str], None],
 ) -> Iterator[Sight]:
-    """What is worth a try: every look that is promising or, if none is, the best.
+    """Look at an image in one way after the other, for sights on which poses are worth a try.
 
-    So is one at which many places look the same: it may show at once that it decides nothing, but
-    is tried again at last if it seemed to decide.
+    Worth a try are promising sights or, if there is none, the best of all. So is one that many
+    places show alike: it may prove at once that the image decides nothing. If it seemed to decide,
+    it comes again at the end, when nothing better was seen.
 
-    What is given is to be tried before the next is asked for.
+    A look costs time: try what it shows before the next is asked for.
 
     :param image: (H, W, 3) uint8 BGR.
     :param colours: what tapes look like to begin with.
-    :param in_vain: how many images before this one were searched and showed nothing; the groups of
-        further looks take turns.
+    :param in_vain: how many images before this one were searched and showed nothing; from one to
+        the next the groups of further looks take turns.
     :param told: where the robot is by something else than the image.
     :param lap: is told the name of each stage that ends.
     """

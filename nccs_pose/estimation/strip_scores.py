@@ -47,7 +47,7 @@ _DAMPING = 1e-6 * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class SeenMap:
     """A map, and how the rig sees its floor."""
 
     lines: FloorLines
@@ -58,10 +58,10 @@ class Place:
 class StripScorer:
     """How well poses explain the strips of one image."""
 
-    def __init__(self, segments: tuple[FloorSegment, ...], place: Place) -> None:
+    def __init__(self, segments: tuple[FloorSegment, ...], seen: SeenMap) -> None:
         self.segments = segments
         self.strips = strips = StripLines(segments)
-        self._lines, self._nearest, self._scale = place.lines, place.nearest, place.scale
+        self._lines, self._nearest, self._scale = seen.lines, seen.nearest, seen.scale
         footprint, weight, pitch = np.array(
             [(s.footprint, s.weight, s.pitch) for s in segments]).T
         share = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
@@ -72,7 +72,7 @@ class StripScorer:
         tolerance = 0.06 + 1.5 * footprint
         self._tolerance = np.repeat(tolerance, _SAMPLES)
         self._pixels_per_metre = np.repeat(pitch / np.maximum(footprint, 1e-9), _SAMPLES)
-        self._layer = np.repeat(place.nearest.layers(strips.colour), _SAMPLES)
+        self._layer = np.repeat(seen.nearest.layers(strips.colour), _SAMPLES)
         # Where a point x, y, 1 is along each strip and across it, within 1 if it lies in it.
         frames = np.stack([strips.direction / (0.5 * strips.length + BEYOND),
                            1j * strips.direction / tolerance])

@@ -38,8 +38,9 @@ _ON = 0.06
 # more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
 _EVIDENT = 7.0
 DISTURBED = 0.28
-# Residuals so many times the noise of the image, and larger than this (px), say that two lines are
-# others, or not seen by this rig; that three are; and that more are, where none was expected.
+# Residuals of so many times the image's noise, and of more px than the second number, say that the
+# lines are other ones than thought, or not seen by this rig: of two lines, of three, and of more
+# where no prediction agrees.
 _UNLIKE_NOISE = ((5.0, 0.0), (3.0, 0.3), (3.0, 0.4))
 
 

@@ -39,7 +39,7 @@ def whole_lines(line_map: LineMap, gap: float = ROW_GAP) -> LineMap:
     They have the same colour, are in line, and touch, overlap, or leave no gap that images show
     for certain. Wider gaps are kept, since they tell one place from another.
 
-    :param gap: another one, over which lines are joined, metres.
+    :param gap: the widest one over which lines are joined, metres.
     :returns: the map itself where there are no such lines.
     """
     wholes = _wholes(line_map, gap)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 import os
 import platform
 import time
@@ -39,7 +40,7 @@ from nccs_pose.evaluation.tables import table
 from nccs_pose.evaluation.trials import Cell, DataSet, make_data_set
 from nccs_pose.geometry.line_trace import trace_line
 from nccs_pose.geometry.lines import Line
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.projection import reflect_points
 from nccs_pose.geometry.reflection_curve import ReflectionCurve
 from nccs_pose.geometry.rig import Rig
@@ -175,10 +176,8 @@ def _work(rig: Rig, data: DataSet) -> dict[str, Callable[[], Any]]:
     }
 
 
-def _difference(a: Pose2, b: np.ndarray) -> float:
-    step = a.as_array() - b
-    step[2] = wrap_angle(step[2])
-    return float(np.abs(step).max())
+def _difference(a: Pose2, b: Pose2) -> float:
+    return float(np.abs(a.minus(b)).max())
 
 
 def _least_squares_apart(rig: Rig, data: DataSet) -> float:
@@ -190,7 +189,7 @@ def _least_squares_apart(rig: Rig, data: DataSet) -> float:
     theirs = least_squares(
         lambda v: whitened_residual(rays, d, mu, Pose2.from_array(v))[0], data.truth.as_array(),
         method='lm', xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return _difference(ours, theirs.x)
+    return _difference(ours, Pose2.from_array(theirs.x))
 
 
 def _poselib_apart(rig: Rig, data: DataSet) -> float | None:
@@ -213,11 +212,13 @@ def _poselib_apart(rig: Rig, data: DataSet) -> float | None:
     return min(_difference(ours, _from_poselib(pose, upright)) for pose in found)
 
 
-def _from_poselib(pose: Any, upright: np.ndarray) -> np.ndarray:
-    """(x, y, yaw) of T_map_base from PoseLib's map-to-base transform with its y axis upright."""
+def _from_poselib(pose: Any, upright: np.ndarray) -> Pose2:
+    """T_map_base from PoseLib's map-to-base transform with its y axis upright."""
     rotation = upright.T @ pose.R @ upright
     position = -rotation.T @ (upright.T @ pose.t)
-    return np.array([position[0], position[1], np.arctan2(rotation[0, 1], rotation[0, 0])])
+    return Pose2(
+        float(position[0]), float(position[1]),
+        math.atan2(float(rotation[0, 1]), float(rotation[0, 0])))
 
 
 def report(benchmark: Benchmark) -> str:

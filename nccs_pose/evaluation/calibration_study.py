@@ -48,6 +48,8 @@ _X, _Y = 1.4, 0.9  # where the robot drives in the arena, metres either way: 0.4
 _FRAMES = 20
 _DRIVE = 150  # images that calibrate looks at, of which it chooses
 _POINTS = 150  # of a line: 75 on each edge of the tape
+# How far off a rig drawn by ruler is: the camera's place, m, and its turn, rad.
+_COP_OFF, _TURN_OFF = 3e-4, np.deg2rad(0.3)
 _COARSE = 33  # steps along a line by which its length in the image is measured
 
 
@@ -104,16 +106,16 @@ def _vector(rng: Random, size: int, length: float) -> Array:
     return length * vector / np.linalg.norm(vector)
 
 
-def off_in_each(rig: Rig, rng: Random, cop: float = 3e-4, tilt: float = np.deg2rad(0.3)) -> Rig:
-    """The rig with each number of the camera's place (m) and turn (rad) off, up or down."""
+def off_in_each(rig: Rig, rng: Random) -> Rig:
+    """The rig with each number of the camera's place and turn off, up or down."""
     signs = rng.choice([-1.0, 1.0], 5)
     return replace(
-        rig, cop=rig.cop + cop * np.array([0.0, *signs[:2]]),
-        R_mirror_camera=rotation_exp(tilt * signs[2:]) @ rig.R_mirror_camera)
+        rig, cop=rig.cop + _COP_OFF * np.array([0.0, *signs[:2]]),
+        R_mirror_camera=rotation_exp(_TURN_OFF * signs[2:]) @ rig.R_mirror_camera)
 
 
 def disturbed(
-    rig: Rig, rng: Random, *, cop: float = 3e-4, tilt: float = np.deg2rad(0.3),
+    rig: Rig, rng: Random, *, cop: float = _COP_OFF, tilt: float = _TURN_OFF,
     height: float = 0.0, rig_tilt: float = 0.0,
 ) -> Rig:
     """The rig as somebody might have drawn it, off by those lengths (m) and angles (rad)."""
@@ -151,10 +153,10 @@ class Bias:
     heading: float
 
 
-def pose_bias(used: Rig, true: Rig, line_map: LineMap, rng: Random, frames: int = 20) -> Bias:
+def pose_bias(used: Rig, true: Rig, line_map: LineMap, rng: Random) -> Bias:
     """What a wrong rig does to poses of frames that no calibration has seen."""
     model, errors = RigModel(used, line_map), []
-    for _ in range(frames):
+    for _ in range(_FRAMES):
         pose = random_pose(rng)
         ideal = predict_frame(true, line_map, pose, sigma=0.2)
         if len(ideal.lines) >= 3:
@@ -214,8 +216,7 @@ def cop_bound(
 
 
 def targets(
-    kinds: Sequence[str], rigs: int, first: int = 0, mounting: bool = True, drive: int = _DRIVE,
-    points: int = _POINTS,
+    kinds: Sequence[str], rigs: int, first: int, mounting: bool, drive: int, points: int,
 ) -> None:
     """20 frames x 4 lines at 0.2 px, each number 0.3 mm or 0.3 degrees off at first.
 
@@ -260,7 +261,7 @@ def targets(
               f'CPU {np.median(seconds):.2f} s, worst {max(seconds):.2f} s', flush=True)
 
 
-def rough_starts(kinds: Sequence[str], rigs: int, first: int = 0) -> None:
+def rough_starts(kinds: Sequence[str], rigs: int, first: int) -> None:
     """COP within 3 mm, tilt within 2 degrees, height within 2 cm, other rigs every time."""
     line_map = arena_map()
     for kind in kinds:

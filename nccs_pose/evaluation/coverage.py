@@ -43,7 +43,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Obstacle, Scene
 import numpy as np
@@ -107,19 +107,15 @@ class Covered:
 
 
 def _ideal(width: int, noise: float, **sensor: Any) -> Callable[[], Scene]:
-    def scene() -> Scene:
-        made = ideal_scene(width, noise)
-        return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))
-
-    return scene
+    return lambda: _with_sensor(ideal_scene(width, noise), **sensor)
 
 
 def _arena(width: int, **sensor: Any) -> Callable[[], Scene]:
-    def scene() -> Scene:
-        made = arena_scene(width)
-        return dataclasses.replace(made, sensor=dataclasses.replace(made.sensor, **sensor))
+    return lambda: _with_sensor(arena_scene(width), **sensor)
 
-    return scene
+
+def _with_sensor(scene: Scene, **changes: Any) -> Scene:
+    return dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, **changes))
 
 
 def _parallel() -> Scene:
@@ -156,7 +152,7 @@ SCENARIOS = (
 
 
 def run_scenario(
-    scenario: Scenario, trials: int, *, seed: int = 3,
+    scenario: Scenario, trials: int, *, seed: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Covered:
     """Play a scenario's trials to one localiser that forgets everything between them."""
@@ -168,16 +164,14 @@ def run_scenario(
         progress(scenario.name)
         if estimate.pose is None or estimate.covariance is None:
             continue
-        error = estimate.pose.as_array() - pose.as_array()
-        error[2] = wrap_angle(error[2])
-        errors.append(error)
+        errors.append(estimate.pose.minus(pose))
         covariances.append(estimate.covariance)
     return Covered(
         scenario, trials, np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)))
 
 
 def play_trial(
-    localiser: Localiser, scenario: Scenario, scene: Scene, k: int, *, seed: int = 3,
+    localiser: Localiser, scenario: Scenario, scene: Scene, k: int, *, seed: int,
 ) -> tuple[Pose2, Estimate]:
     """The true pose and the estimate of a scenario's k-th trial.
 
@@ -200,8 +194,7 @@ def _standing(scene: Scene, options: LocaliserOptions, rng: np.random.Generator)
     z, roll, pitch = rng.standard_normal(3) * (
         options.height_sigma, options.tilt_sigma, options.tilt_sigma)
     off_plane = RigidTransform.from_rpy((roll, pitch, 0.0), (0.0, 0.0, z))
-    return dataclasses.replace(scene, rig=dataclasses.replace(
-        scene.rig, T_base_mirror=off_plane @ scene.rig.T_base_mirror))
+    return scene.mounted(off_plane @ scene.rig.T_base_mirror)
 
 
 def _fresh_floor(scene: Scene, seed: int) -> Scene:

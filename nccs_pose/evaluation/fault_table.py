@@ -20,28 +20,15 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 import math
-from typing import Protocol
 
 from nccs_pose.errors import FrameRefusedError
-from nccs_pose.estimation.estimate import Estimate
+from nccs_pose.estimation.estimate import Answering
 from nccs_pose.evaluation.pose_error import PoseError
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.lines import LineMap
-from nccs_pose.geometry.pose import Pose2
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.drive import ImageSample
 from nccs_pose.simulation.faults import Fault, prepare, Rehearsal
-import numpy as np
-
-
-class Answering(Protocol):
-    """What a localiser must be able to do."""
-
-    def process(self, stamp_ns: int, image: np.ndarray) -> Estimate:
-        """Answer an image; may refuse it with a FrameRefusedError."""
-
-    def add_odometry(self, stamp_ns: int, pose: Pose2) -> object:
-        """Take notice of the wheels; may refuse a sample with a FrameRefusedError."""
 
 
 @dataclass(frozen=True)

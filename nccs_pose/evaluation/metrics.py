@@ -25,6 +25,8 @@ from scipy.stats import chi2, norm
 
 SIGMAS = (1, 2, 3)
 """The multiples of sigma that coverage is counted at."""
+# A true covariance has its mean NEES in the band with this probability.
+_CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +178,7 @@ def nees(error: Array, covariance: Array) -> Array:
     return np.einsum('ni,ni->n', error, solved)
 
 
-def consistency(error: Array, covariance: Array, confidence: float = 0.95) -> Consistency:
+def consistency(error: Array, covariance: Array) -> Consistency:
     """Test covariances (N, 3, 3) against errors (N, 3): NEES with its chi-square band, coverage.
 
     See Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
@@ -185,7 +187,7 @@ def consistency(error: Array, covariance: Array, confidence: float = 0.95) -> Co
     if count == 0:
         nothing = float('nan')
         return Consistency(0, nothing, (nothing, nothing), np.full((3, 3), nothing))
-    tails = 0.5 * (1.0 - confidence)
+    tails = 0.5 * (1.0 - _CONFIDENCE)
     low, high = chi2.ppf([tails, 1.0 - tails], 3 * count) / count
     sigma = np.sqrt(np.einsum('nii->ni', covariance))
     coverage = np.array([np.mean(np.abs(error) <= k * sigma, axis=0) for k in SIGMAS])

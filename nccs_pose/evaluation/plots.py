@@ -33,6 +33,8 @@ import numpy as np
 ESTIMATED = '#1f5fa8'
 TRUE = '#1a1a1a'
 BAND = '#9cc2ea'
+# No robot drives further than this between two poses, m.
+_JUMP = 0.5
 _LINE_COLOURS = {'green': '#2e9e44', 'white': '#b0b0b0', 'yellow': '#d4b400', 'red': '#c8372d',
                  'blue': '#3a6fd8'}
 
@@ -139,8 +141,8 @@ def _limit(axes: Axes, values: Array, band: Array) -> None:
         axes.set_ylim(-reach, reach)
 
 
-def _continuous(trajectory: Trajectory, jump: float = 0.5) -> list[Array]:
+def _continuous(trajectory: Trajectory) -> list[Array]:
     """Split a path where it jumps (a kidnapped robot), so that no line is drawn across."""
     steps = np.hypot(*np.diff(trajectory.poses[:, :2], axis=0).T)
-    usual = max(jump, 6.0 * float(np.median(steps))) if len(steps) else jump
+    usual = max(_JUMP, 6.0 * float(np.median(steps))) if len(steps) else _JUMP
     return np.split(trajectory.poses, np.flatnonzero(steps > usual) + 1)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.estimation.estimate import Estimate
-from nccs_pose.geometry.pose import Pose2, wrap_angle
+from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
 # Closer than both of these is right, whatever the covariance says.
@@ -48,8 +48,7 @@ class PoseError:
         """Of an estimate of the pose that an image was taken from."""
         if estimate.pose is None or estimate.covariance is None:
             return cls()
-        error = estimate.pose.as_array() - truth.as_array()
-        error[2] = wrap_angle(error[2])
+        error = estimate.pose.minus(truth)
         try:
             squared = float(error @ np.linalg.solve(estimate.covariance, error))
         except np.linalg.LinAlgError:

@@ -26,7 +26,6 @@ precision is compared. The mirror is hung straight, because the paper's motion m
 from __future__ import annotations
 
 from collections.abc import Callable
-import dataclasses
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -37,7 +36,7 @@ from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.paper import paper_estimate
 from nccs_pose.estimation.refine import refine
 from nccs_pose.evaluation.tables import table
-from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
 from nccs_pose.geometry.small_matrices import inverse
 from nccs_pose.simulation.renderer import expected_image, render
 from nccs_pose.simulation.scene import ideal_scene, Scene
@@ -106,8 +105,7 @@ def straight_scene(width: int, noise: float) -> Scene:
     mounting = scene.rig.T_base_mirror
     _, _, yaw = mounting.rpy()
     straight = RigidTransform.from_rpy(np.array([np.pi, 0.0, yaw]), mounting.translation)
-    return dataclasses.replace(
-        scene, rig=dataclasses.replace(scene.rig, T_base_mirror=straight))
+    return scene.mounted(straight)
 
 
 def image_information(scene: Scene, pose: Pose2) -> Array:
@@ -149,9 +147,8 @@ def image_bound(information: Array, height_sigma: float = 0.0) -> Array:
 def _raised(scene: Scene, height: float) -> Scene:
     """The scene seen by a mirror that hangs so much higher, metres."""
     mounting = scene.rig.T_base_mirror
-    raised = RigidTransform(
-        mounting.rotation, mounting.translation + np.array([0.0, 0.0, height]))
-    return dataclasses.replace(scene, rig=dataclasses.replace(scene.rig, T_base_mirror=raised))
+    return scene.mounted(RigidTransform(
+        mounting.rotation, mounting.translation + np.array([0.0, 0.0, height])))
 
 
 def blob_pixels(
@@ -206,7 +203,7 @@ def _by_sampling(
 
 
 def run_precision(
-    width: int, poses: int, *, noise: float = 0.05, seed: int = 1,
+    width: int, poses: int, *, noise: float, seed: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Precision:
     """Measure all methods on one image of each of some random poses.
@@ -239,9 +236,7 @@ def run_precision(
             if answer is not None:
                 found[name] = answer
         for name, estimate in found.items():
-            error = estimate.as_array() - pose.as_array()
-            error[2] = wrap_angle(error[2])
-            errors[name].append(error)
+            errors[name].append(estimate.minus(pose))
         progress(f'{width} px')
     return Precision(
         width, noise, {name: np.reshape(e, (-1, 3)) for name, e in errors.items()}, poses,

@@ -24,7 +24,8 @@ the result.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 import time
 from typing import Any
@@ -47,6 +48,7 @@ SEARCHING = 'searching'
 STAGES = tuple(field.name for field in fields(StageTimes))
 LEAST_FRAMES = 4
 _RATE = 10.0
+_SEED = 4
 _GREEN = ((40, 50, 40), (90, 255, 255))
 
 
@@ -80,8 +82,19 @@ def threshold_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), *_GREEN)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold OpenCV to one thread, so that processor times can be compared."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
 def measure_stages(
-    width: int, frames: int, *, seed: int = 4,
+    width: int, frames: int, *,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StageCosts:
     """Time tracking and searching on the same drive.
@@ -93,16 +106,14 @@ def measure_stages(
     if frames < LEAST_FRAMES:
         raise OptionError(f'frames = {frames}: quartiles need at least {LEAST_FRAMES}')
     scene, track = arena_scene(width), figure_of_eight()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     wheels = measure_odometry(
-        track, frames / _RATE, WheelModel(rate=_RATE), np.random.default_rng([seed, 1]), 0)
+        track, frames / _RATE, WheelModel(rate=_RATE), np.random.default_rng([_SEED, 1]), 0)
     images = []
     for k in range(frames):
         images.append(render(scene, track.pose(k / _RATE), rng))
         progress('rendered')
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with one_thread():
         start = time.perf_counter()
         localiser = Localiser(scene.rig, scene.line_map)
         localiser.process(0, images[0])
@@ -110,8 +121,6 @@ def measure_stages(
         told = [sample.pose for sample in wheels]
         modes = {mode: _run(localiser, told, images, mode, progress)
                  for mode in (TRACKING, SEARCHING)}
-    finally:
-        cv2.setNumThreads(threads)
     return StageCosts(
         width,
         {mode: np.array([frame.threshold for frame in run]) for mode, run in modes.items()},

@@ -28,13 +28,12 @@ from dataclasses import dataclass
 import gc
 import zlib
 
-import cv2
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.pose_error import PoseError
-from nccs_pose.evaluation.stages import timed
+from nccs_pose.evaluation.stages import one_thread, timed
 from nccs_pose.evaluation.tables import table
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -108,26 +107,24 @@ def run_starts(
     states: Counter[State] = Counter()
     wrong = without = 0
     costs = []
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
     # As the node does: what is built lives on, and is not gone through at every collection.
     gc.collect()
     gc.freeze()
     try:
-        for k in range(trials):
-            rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), k])
-            pose = _somewhere(place.line_map, rng)
-            image = render(scene, pose, rng)
-            localiser.reset()
-            estimate, cost, threshold = timed(localiser, 0, image)
-            states[estimate.state] += 1
-            wrong += PoseError.of(estimate, pose).wrong
-            without += _is_without(estimate, pose)
-            costs.append((cost, threshold))
-            progress(place.name)
+        with one_thread():
+            for k in range(trials):
+                rng = np.random.default_rng([seed, zlib.crc32(place.name.encode()), k])
+                pose = _somewhere(place.line_map, rng)
+                image = render(scene, pose, rng)
+                localiser.reset()
+                estimate, cost, threshold = timed(localiser, 0, image)
+                states[estimate.state] += 1
+                wrong += PoseError.of(estimate, pose).wrong
+                without += _is_without(estimate, pose)
+                costs.append((cost, threshold))
+                progress(place.name)
     finally:
         gc.unfreeze()
-        cv2.setNumThreads(threads)
     return Starts(place, width, states, wrong, without, *np.array(costs).T)
 
 

@@ -32,7 +32,7 @@ from nccs_pose.estimation.global_pose import solve
 from nccs_pose.estimation.image_refine import refine_in_image
 from nccs_pose.estimation.paper import paper_estimate
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
@@ -171,8 +171,7 @@ def our_estimate(rig: Rig, data: DataSet, cell: Cell) -> Pose2 | None:
 def _answer(name: str, pose: Pose2 | None, truth: Pose2, bound: Array | None) -> Answer:
     if pose is None:
         return Answer(name, None, None)
-    error = pose.as_array() - truth.as_array()
-    error[2] = wrap_angle(error[2])
+    error = pose.minus(truth)
     nees = None if bound is None else float(error @ np.linalg.solve(bound, error))
     x, y, yaw = error.tolist()
     return Answer(name, (x, y, yaw), nees)

@@ -27,16 +27,10 @@ class StampedImage:
     """A camera image, not yet decoded.
 
     :ivar stamp_ns: the header's stamp, nanoseconds.
-    :ivar received_ns: when the recorder received it (bag time), nanoseconds.
-    :ivar frame_id: the header's frame.
-    :ivar topic: where it was published.
     :ivar message: sensor_msgs/Image or CompressedImage, as rosbags reads it.
     """
 
     stamp_ns: int
-    received_ns: int
-    frame_id: str
-    topic: str
     message: Any = field(repr=False, compare=False)
 
     def decode(self) -> Image:
@@ -57,28 +51,12 @@ class StampedOdometry:
     """A wheel odometry pose: `child_frame_id` in `frame_id`.
 
     :ivar stamp_ns: the header's stamp, nanoseconds.
-    :ivar received_ns: when the recorder received it (bag time), nanoseconds.
     """
 
     stamp_ns: int
-    received_ns: int
     frame_id: str
     child_frame_id: str
     pose: Pose2
 
 
-@dataclass(frozen=True)
-class StampedTruth:
-    """A ground-truth pose: `base_link` in `frame_id`.
-
-    :ivar stamp_ns: the header's stamp, nanoseconds.
-    :ivar received_ns: when the recorder received it (bag time), nanoseconds.
-    """
-
-    stamp_ns: int
-    received_ns: int
-    frame_id: str
-    pose: Pose2
-
-
-BagEvent = StampedImage | StampedOdometry | StampedTruth
+BagEvent = StampedImage | StampedOdometry

@@ -58,7 +58,7 @@ def _qos(depth: int, durability: QosDurability) -> Qos:
 class BagWriter:
     """A new bag; use it as a context manager. After an error the bag has no metadata.yaml.
 
-    Bag time (`received_ns`) is the stamp unless given. Messages may come in any order.
+    Every message is received at its stamp. They may come in any order.
 
     :param path: the folder to make; it must not exist.
     :raises FileError: if it exists or cannot be made, or a value cannot be written.
@@ -90,7 +90,6 @@ class BagWriter:
 
     def write_image(
         self, stamp_ns: int, image: Image, *, compression: str = '', quality: int = 95,
-        received_ns: int | None = None, frame_id: str = 'camera_optical',
         topic: str = IMAGE_TOPIC,
     ) -> None:
         """Write a BGR image (H, W, 3) uint8, raw or compressed.
@@ -99,11 +98,10 @@ class BagWriter:
             ``<topic>/compressed``.
         :param quality: of a JPEG, 0 to 100.
         """
-        header = self._header(stamp_ns, frame_id)
-        received = self._time(stamp_ns, received_ns)
+        header = self._header(stamp_ns, 'camera_optical')
         if not compression:
             height, width = image.shape[:2]
-            self._write(topic, 'sensor_msgs/msg/Image', received, {
+            self._write(topic, 'sensor_msgs/msg/Image', stamp_ns, {
                 'header': header, 'height': height, 'width': width, 'encoding': 'bgr8',
                 'is_bigendian': 0, 'step': 3 * width,
                 'data': np.ascontiguousarray(image, np.uint8).reshape(-1)})
@@ -112,72 +110,49 @@ class BagWriter:
             raise FileError(
                 f'{self.path}: image compression {compression!r} is not one of jpeg, png.')
         parameters = [cv2.IMWRITE_JPEG_QUALITY, quality] if compression == 'jpeg' else []
-        self.write_encoded_image(
-            stamp_ns, f'bgr8; {compression} compressed bgr8',
-            cv2.imencode(f'.{compression}', image, parameters)[1].tobytes(),
-            received_ns=received, frame_id=frame_id, topic=topic)
+        self._write(f'{topic}/compressed', 'sensor_msgs/msg/CompressedImage', stamp_ns, {
+            'header': header, 'format': f'bgr8; {compression} compressed bgr8',
+            'data': cv2.imencode(f'.{compression}', image, parameters)[1].reshape(-1)})
 
-    def write_encoded_image(
-        self, stamp_ns: int, image_format: str, data: bytes, *, received_ns: int | None = None,
-        frame_id: str = 'camera_optical', topic: str = IMAGE_TOPIC,
-    ) -> None:
-        """Write the bytes of a JPEG or PNG as they are, to ``<topic>/compressed``."""
-        received = self._time(stamp_ns, received_ns)
-        self._write(f'{topic}/compressed', 'sensor_msgs/msg/CompressedImage', received, {
-            'header': self._header(stamp_ns, frame_id), 'format': image_format,
-            'data': np.frombuffer(data, np.uint8)})
-
-    def write_camera_info(
-        self, stamp_ns: int, camera: PinholeCamera, *, received_ns: int | None = None,
-        frame_id: str = 'camera_optical', topic: str = CAMERA_INFO_TOPIC,
-    ) -> None:
+    def write_camera_info(self, stamp_ns: int, camera: PinholeCamera) -> None:
         """Write the calibration of a camera that is not rectified (R = I, P = [K 0])."""
         length = 5 if camera.distortion_model == 'plumb_bob' else 8
         distortion = np.zeros(length)
         distortion[:len(camera.distortion)] = camera.distortion
         region = self._make('sensor_msgs/msg/RegionOfInterest', {
             'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0, 'do_rectify': False})
-        self._write(topic, 'sensor_msgs/msg/CameraInfo', self._time(stamp_ns, received_ns), {
-            'header': self._header(stamp_ns, frame_id), 'height': camera.height,
+        self._write(CAMERA_INFO_TOPIC, 'sensor_msgs/msg/CameraInfo', stamp_ns, {
+            'header': self._header(stamp_ns, 'camera_optical'), 'height': camera.height,
             'width': camera.width, 'distortion_model': camera.distortion_model, 'd': distortion,
             'k': camera.K.ravel(), 'r': np.eye(3).ravel(),
             'p': np.hstack([camera.K, np.zeros((3, 1))]).ravel(), 'binning_x': 0, 'binning_y': 0,
             'roi': region})
 
     def write_odometry(
-        self, stamp_ns: int, pose: Pose2, *, covariance: np.ndarray | None = None,
-        twist: tuple[float, float] = (0.0, 0.0), received_ns: int | None = None,
-        frame_id: str = 'odom', child_frame_id: str = 'base_link', topic: str = ODOMETRY_TOPIC,
+        self, stamp_ns: int, pose: Pose2, *, twist: tuple[float, float] = (0.0, 0.0),
+        frame_id: str = 'odom', child_frame_id: str = 'base_link',
     ) -> None:
-        """Write a wheel odometry pose.
+        """Write a wheel odometry pose; its covariances are zero, which says that none is known.
 
-        :param covariance: of (x, y, yaw), (3, 3); m^2, m rad, rad^2; zero (unknown) if not given.
         :param twist: forward speed in m/s and turning rate in rad/s.
         """
-        full = np.zeros((6, 6))
-        if covariance is not None:
-            full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
         speed = self._make('geometry_msgs/msg/Twist', {
             'linear': self._xyz('Vector3', twist[0], 0.0),
             'angular': self._xyz('Vector3', 0.0, 0.0, twist[1])})
-        self._write(topic, 'nav_msgs/msg/Odometry', self._time(stamp_ns, received_ns), {
+        self._write(ODOMETRY_TOPIC, 'nav_msgs/msg/Odometry', stamp_ns, {
             'header': self._header(stamp_ns, frame_id), 'child_frame_id': child_frame_id,
             'pose': self._make('geometry_msgs/msg/PoseWithCovariance', {
-                'pose': self._pose(pose), 'covariance': full.ravel()}),
+                'pose': self._pose(pose), 'covariance': np.zeros(36)}),
             'twist': self._make('geometry_msgs/msg/TwistWithCovariance', {
                 'twist': speed, 'covariance': np.zeros(36)})})
 
-    def write_truth(
-        self, stamp_ns: int, pose: Pose2, *, received_ns: int | None = None,
-        frame_id: str = 'map', topic: str = GROUND_TRUTH_TOPIC,
-    ) -> None:
-        """Write a ground-truth pose of base_link."""
-        self._write(topic, 'geometry_msgs/msg/PoseStamped', self._time(stamp_ns, received_ns), {
-            'header': self._header(stamp_ns, frame_id), 'pose': self._pose(pose)})
+    def write_truth(self, stamp_ns: int, pose: Pose2) -> None:
+        """Write a ground-truth pose of base_link in the map."""
+        self._write(GROUND_TRUTH_TOPIC, 'geometry_msgs/msg/PoseStamped', stamp_ns, {
+            'header': self._header(stamp_ns, 'map'), 'pose': self._pose(pose)})
 
     def write_tf_static(
-        self, stamp_ns: int, transforms: Sequence[tuple[str, str, RigidTransform]], *,
-        received_ns: int | None = None, topic: str = TF_STATIC_TOPIC,
+        self, stamp_ns: int, transforms: Sequence[tuple[str, str, RigidTransform]],
     ) -> None:
         """Write fixed transforms: parent frame, child frame, T_parent_child."""
         messages = []
@@ -188,19 +163,18 @@ class BagWriter:
             messages.append(self._make('geometry_msgs/msg/TransformStamped', {
                 'header': self._header(stamp_ns, parent), 'child_frame_id': child,
                 'transform': motion}))
-        self._write(topic, 'tf2_msgs/msg/TFMessage', self._time(stamp_ns, received_ns), {
-            'transforms': messages})
+        self._write(TF_STATIC_TOPIC, 'tf2_msgs/msg/TFMessage', stamp_ns, {'transforms': messages})
 
-    def _write(self, topic: str, kind: str, received_ns: int, values: dict[str, Any]) -> None:
+    def _write(self, topic: str, kind: str, stamp_ns: int, values: dict[str, Any]) -> None:
         if (topic, kind) not in self._connections:
-            latched = topic.endswith('tf_static')
+            latched = topic == TF_STATIC_TOPIC
             qos = _qos(1, QosDurability.TRANSIENT_LOCAL) if latched else _qos(
                 10, QosDurability.VOLATILE)
             self._connections[topic, kind] = self._writer.add_connection(
                 topic, kind, typestore=self._types, offered_qos_profiles=[qos])
         data = self._types.serialize_cdr(self._make(kind, values), kind)
         try:
-            self._writer.write(self._connections[topic, kind], received_ns, data)
+            self._writer.write(self._connections[topic, kind], stamp_ns, data)
         except OSError as error:
             raise FileError(f'{self.path}: cannot be written: {error.strerror}.') from error
 
@@ -228,7 +202,3 @@ class BagWriter:
         return self._make(
             'geometry_msgs/msg/Quaternion',
             {key: float(value) for key, value in zip('xyzw', xyzw)})
-
-    @staticmethod
-    def _time(stamp_ns: int, received_ns: int | None) -> int:
-        return stamp_ns if received_ns is None else received_ns

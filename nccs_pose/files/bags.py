@@ -27,7 +27,7 @@ from typing import Any
 
 from nccs_pose.errors import FileError, GeometryError
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry, StampedTruth
+from nccs_pose.files.bag_events import BagEvent, StampedImage, StampedOdometry
 from nccs_pose.files.bag_opening import in_words, open_bag
 from nccs_pose.files.bag_topics import (
     BagTopics,
@@ -42,8 +42,7 @@ from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
-__all__ = [
-    'BagReader', 'BagTopics', 'BagWriter', 'StampedImage', 'StampedOdometry', 'StampedTruth']
+__all__ = ['BagReader', 'BagTopics', 'BagWriter', 'StampedImage', 'StampedOdometry']
 
 
 class BagReader:
@@ -86,11 +85,15 @@ class BagReader:
 
     def image_count(self) -> int:
         """How many images the bag holds."""
-        return self._count(self._image_topic())
+        topic = self._image_topic()
+        return sum(c.msgcount for c in self._reader.connections if c.topic == topic)
 
     def camera(self) -> PinholeCamera | None:
         """The camera of the first CameraInfo; None if there is none, or it is not calibrated."""
-        for _, message in self._messages(self.topics.camera_info):
+        topic = self.topics.camera_info
+        if topic is None:
+            return None
+        for _, _, message in self._messages([topic]):
             if not np.any(message.k):
                 return None
             try:
@@ -98,12 +101,11 @@ class BagReader:
                     int(message.width), int(message.height), np.reshape(message.k, (3, 3)),
                     message.distortion_model or 'plumb_bob', message.d)
             except GeometryError as error:
-                raise FileError(
-                    f'{self.path}: {self.topics.camera_info}: {error}') from error
+                raise FileError(f'{self.path}: {topic}: {error}') from error
         return None
 
-    def events(self, odometry: bool = True, ground_truth: bool = False) -> Iterator[BagEvent]:
-        """Images, and odometry and ground truth if wanted and there, by time of reception.
+    def events(self, odometry: bool = True) -> Iterator[BagEvent]:
+        """Images, and odometry if wanted and there, by time of reception.
 
         Odometry that is no pose is left out, as the node does.
 
@@ -111,26 +113,17 @@ class BagReader:
         """
         names = [self._image_topic()]
         names += [self.topics.odom] if odometry and self.topics.odom else []
-        truth = self.topics.ground_truth if ground_truth else None
-        names += [truth] if truth and truth not in names else []
-        for topic, kind, received, message in self._raw(names):
+        for topic, kind, message in self._messages(names):
             if kind in TYPES['image']:
-                yield StampedImage(
-                    _stamp(message), received, message.header.frame_id, topic, message)
+                yield StampedImage(_stamp(message), message)
                 continue
-            if topic == self.topics.odom and odometry:
-                try:
-                    pose = self._pose(topic, kind, message)
-                except FileError as error:
-                    self.left_out.append(str(error))
-                    continue
-                yield StampedOdometry(
-                    _stamp(message), received, message.header.frame_id, message.child_frame_id,
-                    pose)
-            if topic == truth:
-                yield StampedTruth(
-                    _stamp(message), received, message.header.frame_id,
-                    self._pose(topic, kind, message))
+            try:
+                pose = self._pose(topic, kind, message)
+            except FileError as error:
+                self.left_out.append(str(error))
+                continue
+            yield StampedOdometry(
+                _stamp(message), message.header.frame_id, message.child_frame_id, pose)
 
     def ground_truth(self) -> Trajectory:
         """All ground-truth poses by rising stamp.
@@ -153,7 +146,7 @@ class BagReader:
     def _trajectory(self, topic: str) -> Trajectory:
         rows = [
             (_stamp(message), self._pose(topic, kind, message))
-            for _, kind, _, message in self._raw([topic])]
+            for _, kind, message in self._messages([topic])]
         return Trajectory(
             np.array([stamp for stamp, _ in rows], dtype=np.int64),
             np.array([pose.as_array() for _, pose in rows])).in_order()
@@ -164,16 +157,8 @@ class BagReader:
                 f'{self.path}: has no images; it has {list_topics(self.topic_types())}.')
         return self.topics.image
 
-    def _count(self, topic: str) -> int:
-        return sum(c.msgcount for c in self._reader.connections if c.topic == topic)
-
-    def _messages(self, topic: str | None) -> Iterator[tuple[int, Any]]:
-        if topic is not None:
-            for _, _, received, message in self._raw([topic]):
-                yield received, message
-
-    def _raw(self, topics: list[str]) -> Iterator[tuple[str, str, int, Any]]:
-        """Topic, type, time of reception and message, by time."""
+    def _messages(self, topics: list[str]) -> Iterator[tuple[str, str, Any]]:
+        """Topic, type and message, by time of reception."""
         connections = [c for c in self._reader.connections if c.topic in topics]
         iterator = self._reader.messages(connections=connections)
         while True:
@@ -184,7 +169,7 @@ class BagReader:
                 connection, received, data = item
             with in_words(self.path, f'message on {connection.topic} at {received} ns'):
                 message = self._reader.deserialize(data, connection.msgtype)
-            yield connection.topic, connection.msgtype, received, message
+            yield connection.topic, connection.msgtype, message
 
     def _pose(self, topic: str, kind: str, message: Any) -> Pose2:
         pose = message.pose if kind == POSE else message.pose.pose

@@ -20,11 +20,13 @@ from typing import Any
 
 from nccs_pose.files.yaml_sections import read_yaml
 
+_NODE = 'localiser'
 
-def load_parameters(path: str | Path, node: str) -> dict[str, Any]:
-    """Read the parameters that a file gives to a node, whatever its namespace.
 
-    Sections `<namespace>/<node>` and those for every node (`/**`) are taken, later ones over
+def load_parameters(path: str | Path) -> dict[str, Any]:
+    """Read the parameters that a file gives to the node `localiser`, whatever its namespace.
+
+    Sections `<namespace>/localiser` and those for every node (`/**`) are taken, later ones over
     earlier ones.
 
     :raises FileError: if the file has no such section, or is no parameter file.
@@ -32,11 +34,11 @@ def load_parameters(path: str | Path, node: str) -> dict[str, Any]:
     top = read_yaml(path)
     found: dict[str, Any] | None = None
     for key in top.names():
-        if key.rsplit('/', 1)[-1] in (node, '*', '**'):
+        if key.rsplit('/', 1)[-1] in (_NODE, '*', '**'):
             section = top.section(key)
             found = {**(found or {}), **section.section('ros__parameters').content()}
             section.done()
     if found is None:
         others = ', '.join(top.names()) or 'nothing'
-        raise top.error(node, f'is missing: there are only parameters of {others}')
+        raise top.error(_NODE, f'is missing: there are only parameters of {others}')
     return found

@@ -65,10 +65,11 @@ def load_rig(path: str | Path) -> Rig:
     return _build(top, 'camera', lambda: Rig(quadric, pinhole, cop, rotation, transform))
 
 
-def load_map(path: str | Path, *, tapes: bool = True) -> LineMap:
+def load_map(path: str | Path) -> LineMap:
     """Read a map: `lines` with start and end, and their common width, colour and frame.
 
-    :param tapes: refuse a line that no image shows: above the floor, or without a width.
+    Lines that no image shows, above the floor or without a width, are refused.
+
     :raises FileError: one sentence that names the file, the key, the value and what is accepted.
     """
     top = read_yaml(path)
@@ -84,7 +85,7 @@ def load_map(path: str | Path, *, tapes: bool = True) -> LineMap:
         raise top.error('lines', f'must hold at least 2 lines, it holds {len(lines)}')
     _refuse_repetition(lines, sections)
     for line, section in zip(lines, sections):
-        if tapes and not line.is_tape:
+        if not line.is_tape:
             raise section.error(
                 '', f'(line {line.name!r}) is no tape on the floor, and images show nothing else: '
                 f'its width must be above 0 m, not {line.width:g}, and its z be 0 m, not '
@@ -142,8 +143,8 @@ def _mirror(section: Section) -> QuadricMirror:
 
 
 def _camera(section: Section) -> PinholeCamera:
-    width = section.integer('width', 1, _MOST_PIXELS)
-    height = section.integer('height', 1, _MOST_PIXELS)
+    width = section.count('width', _MOST_PIXELS)
+    height = section.count('height', _MOST_PIXELS)
     K = section.numbers('K', (9,), unit='px').reshape(3, 3)
     if K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise section.error('K', f'must have focal lengths above 0, not {K[0, 0]} and {K[1, 1]}')

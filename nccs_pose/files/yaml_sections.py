@@ -185,14 +185,14 @@ class Section:
             raise self.error(key, f'must be {accepted}, not {describe(value)}')
         return number
 
-    def integer(self, key: str, low: int, high: int) -> int:
-        accepted = f'a whole number from {low} to {high}'
+    def count(self, key: str, most: int) -> int:
+        accepted = f'a whole number from 1 to {most}'
         value = self.value(key, accepted=accepted)
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
             raise self.error(key, f'must be {accepted}, not {describe(value)}')
         return value
 
-    def text(self, key: str, default: Any = _REQUIRED, choices: Sequence[str] = ()) -> str:
+    def text(self, key: str, default: str, choices: Sequence[str] = ()) -> str:
         accepted = f'one of {", ".join(choices)}' if choices else 'a word'
         value = self.value(key, default, accepted)
         if not isinstance(value, str) or not value or (choices and value not in choices):

@@ -74,10 +74,6 @@ class Bivariate:
         size = np.abs(self.coefficients)
         return [(int(i), int(j)) for i, j in np.argwhere(size > relative * size.max())]
 
-    def degree(self, relative: float = 1e-12) -> int:
-        """Total degree, without what rounding left; -1 for the zero polynomial."""
-        return max((i + j for i, j in self.monomials(relative)), default=-1)
-
 
 def _poly(*terms: tuple[int, int, float]) -> Bivariate:
     """Sum of c y^i z^j from (i, j, c)."""

@@ -46,6 +46,9 @@ from numpy.typing import ArrayLike, NDArray
 
 _REAL_ROOT = 1e-6
 _FLAT = 1e-12
+# A point is on a branch if it is no further off, metres: between ray and line for S, on the mirror
+# for E.
+_ON_BRANCH = 1e-6
 
 
 class Branch(IntEnum):
@@ -174,20 +177,17 @@ class ReflectionCurve:
         apart = np.linalg.norm(np.cross(between, self.direction), axis=1)
         return np.where(norm > _FLAT, skew, apart)
 
-    def branch(self, points: Array, tolerance: float = 1e-6) -> NDArray[np.int_]:
-        """The :class:`Branch` of mirror points (N, 3); the line's own image goes first.
-
-        :param tolerance: metres; between ray and line for S, on the mirror for E.
-        """
+    def branch(self, points: Array) -> NDArray[np.int_]:
+        """The :class:`Branch` of mirror points (N, 3); the line's own image goes first."""
         mirrored = points * [-1.0, 1.0, 1.0]
         _, ahead = self.along_line(points)
-        on_curve = self.distance(points) <= tolerance
+        on_curve = self.distance(points) <= _ON_BRANCH
         base = self._base
         e = base.E(points[:, 1], points[:, 2])
         slope = np.hypot(base.s(points[:, 1], points[:, 2]), np.abs(self.cop[1]))
         return np.select(
-            [on_curve & (ahead > 0.0), on_curve, self.distance(mirrored) <= tolerance,
-             np.abs(e) <= tolerance * np.maximum(slope, _FLAT)],
+            [on_curve & (ahead > 0.0), on_curve, self.distance(mirrored) <= _ON_BRANCH,
+             np.abs(e) <= _ON_BRANCH * np.maximum(slope, _FLAT)],
             [Branch.PHYSICAL, Branch.VIRTUAL, Branch.MIRRORED, Branch.SPURIOUS], Branch.OFF)
 
     def visible(self, points: Array) -> NDArray[np.bool_]:

@@ -49,7 +49,7 @@ from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_n
 from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise, leave, told_to_end
-from nccs_pose.ros.transport import use_large_images
+from nccs_pose.ros.transport import stay_alone, use_large_images
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -138,9 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', default='out', type=Path, help='folder for the pictures')
     options = parser.parse_args(argv)
     use_large_images()
-    # By itself, unless the user says where: another robot's images would be localised as well.
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 99))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    stay_alone()
     _say(f'on ROS_DOMAIN_ID {os.environ["ROS_DOMAIN_ID"]}, where you can watch')
     try:
         initialise([])

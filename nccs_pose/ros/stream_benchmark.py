@@ -42,7 +42,7 @@ from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.conversions import compressed_message, image_message, stamp_to_ns
 from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise, StartError, told_to_end
-from nccs_pose.ros.transport import use_large_images
+from nccs_pose.ros.transport import stay_alone, use_large_images
 from nccs_pose.simulation.drive import make_drive, render_frame
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.scene import arena_scene, Scene
@@ -148,9 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--formats', nargs='+', choices=('raw', 'jpeg'), default=['raw', 'jpeg'])
     options = parser.parse_args(argv)
     use_large_images()
-    # Alone on its domain: another robot's images would be counted too.
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 99))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    stay_alone()
     print(f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; '
           f'rendering {DISTINCT_FRAMES} frames', flush=True)
     rows = [['1280 x 960', 'sent', 'received', 'dropped busy', 'lost', 'poses', 'p50 (ms)',

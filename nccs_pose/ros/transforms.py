@@ -77,11 +77,6 @@ class TransformOutput:
             self._listener = tf2_ros.TransformListener(self._buffer, node)
             self._not_yet = tf2_ros.TransformException
 
-    @property
-    def waits(self) -> bool:
-        """Whether an estimate still waits for its odometry transform."""
-        return bool(self._pending)
-
     def broadcast(self, stamp_ns: int, pose: Pose2) -> None:
         """Broadcast the transform of a new estimate T_map_base, now or when it can be made."""
         options = self._options()

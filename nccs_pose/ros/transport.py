@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The middleware's settings for camera images."""
+"""The middleware's settings, for camera images and for trials beside other robots."""
 
 from __future__ import annotations
 
@@ -31,3 +31,12 @@ def use_large_images() -> None:
     profile = share_directory() / 'config' / 'fastdds_large_images.xml'
     if profile.is_file():
         os.environ.setdefault(VARIABLE, str(profile))
+
+
+def stay_alone() -> None:
+    """Keep this process and what it starts to a domain of their own, if the user chose none.
+
+    Another robot's images would be localised and counted as well. Before ROS is initialised.
+    """
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 99))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -173,7 +173,7 @@ def measure_odometry(
     return tuple(samples)
 
 
-def stream(scene: Scene, drive: Drive, seed: int = 0) -> Iterator[Sample]:
+def stream(scene: Scene, drive: Drive, seed: int) -> Iterator[Sample]:
     """Give images and odometry in the order of their stamps, each image rendered in its turn.
 
     A frame's noise depends on the seed and its number alone, so that any frame can be rendered

@@ -128,7 +128,7 @@ def track(seed: int) -> Loop:
     return random_loop(np.random.default_rng(seed))
 
 
-def rehearse(width: int = 640, frames: int = 24, seed: int = 0) -> Rehearsal:
+def rehearse(width: int, frames: int, seed: int = 0) -> Rehearsal:
     """Drive through the arena: clean frames, then room for the fault and for recovery."""
     rng = np.random.default_rng([seed, 1])
     drive = make_drive(track(seed), frames, FRAME_RATE, WheelModel(), rng)

@@ -26,6 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
+_WAYPOINTS = 6  # of a random loop
+
 
 @dataclasses.dataclass(frozen=True)
 class Twist:
@@ -120,33 +122,26 @@ class Loop:
         return Twist(self.speed, self.speed * float(vx * ay - vy * ax) / math.hypot(vx, vy) ** 3)
 
 
-def figure_of_eight(
-    length: float = 2.2, width: float = 1.3, speed: float = 0.35, phase: float = 0.0
-) -> Loop:
-    """Give a lying figure of eight about the map's origin: turns both ways, crosses itself.
+def figure_of_eight(speed: float = 0.35, phase: float = 0.0) -> Loop:
+    """Give a lying figure of eight, 2.2 x 1.3 m about the map's origin: turns both ways.
 
-    :param length: along x, m.
-    :param width: along y, m.
     :param speed: m/s.
     :param phase: where it begins: 0 in the middle, -pi/2 at the end of least x, rad.
     """
     angle = phase + np.arange(16) * (2.0 * np.pi / 16)
-    points = np.stack([0.5 * length * np.sin(angle), 0.5 * width * np.sin(2.0 * angle)], axis=1)
+    points = np.stack([1.1 * np.sin(angle), 0.65 * np.sin(2.0 * angle)], axis=1)
     return Loop(points, speed)
 
 
-def random_loop(
-    rng: np.random.Generator, half_size: ArrayLike = (1.2, 0.8), speed: float = 0.35,
-    waypoints: int = 6,
-) -> Loop:
+def random_loop(rng: np.random.Generator, speed: float = 0.35) -> Loop:
     """Give a smooth loop of its own for every generator, about the map's origin.
 
-    :param half_size: of the region that the waypoints keep to along x and y, m.
+    Its waypoints stay within 1.2 m of the origin along x and 0.8 m along y.
     """
-    step = 2.0 * np.pi / waypoints
-    angle = step * (np.arange(waypoints) + rng.uniform(-0.15, 0.15, waypoints))
+    step = 2.0 * np.pi / _WAYPOINTS
+    angle = step * (np.arange(_WAYPOINTS) + rng.uniform(-0.15, 0.15, _WAYPOINTS))
     angle += rng.uniform(0.0, 2.0 * np.pi)
-    radius = rng.uniform(0.65, 1.0, waypoints)
+    radius = rng.uniform(0.65, 1.0, _WAYPOINTS)
     way = rng.choice([-1.0, 1.0])
     ellipse = np.stack([np.cos(angle), way * np.sin(angle)], axis=1)
-    return Loop(radius[:, None] * ellipse * np.asarray(half_size, dtype=float), speed)
+    return Loop(radius[:, None] * ellipse * np.array([1.2, 0.8]), speed)

@@ -153,6 +153,11 @@ class Scene:
     appearance: Appearance = dataclasses.field(default_factory=Appearance)
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
 
+    def mounted(self, T_base_mirror: RigidTransform) -> Scene:
+        """The same with the mirror mounted otherwise on the robot."""
+        return dataclasses.replace(
+            self, rig=dataclasses.replace(self.rig, T_base_mirror=T_base_mirror))
+
     def __post_init__(self) -> None:
         for line in (*self.line_map, *self.appearance.patches):
             if abs(line.start[2]) > 1e-9 or abs(line.end[2]) > 1e-9:

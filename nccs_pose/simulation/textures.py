@@ -26,19 +26,17 @@ import numpy as np
 _TILES, _TEXELS = 4, 128
 # Blurred copies of the pattern, each twice as coarse, so that far floor does not flicker.
 _LEVELS = 6
+_SLOPE = 1.2  # the amplitude of clouds falls with frequency to this power
 _WALL_SCALE = 80.0  # texels per metre of wall and ceiling
 
 
-def clouds(height: int, width: int, rng: np.random.Generator, slope: float = 1.2) -> np.ndarray:
-    """Give a periodic random pattern (height, width), mean 0 and standard deviation 1.
-
-    :param slope: its amplitude falls with frequency to this power.
-    """
+def clouds(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Give a periodic random pattern (height, width), mean 0 and standard deviation 1."""
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
     frequency[0, 0] = np.inf
     shape = frequency.shape
     spectrum = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
-    pattern = np.fft.irfft2(spectrum * frequency**-slope, s=(height, width))
+    pattern = np.fft.irfft2(spectrum * frequency**-_SLOPE, s=(height, width))
     return (pattern - pattern.mean()) / pattern.std()
 
 

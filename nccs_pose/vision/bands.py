@@ -34,8 +34,8 @@ class Bands:
     :ivar half_width: half of the tape's width along ``across`` (N,), px.
     :ivar spacing: length of curve that the station stands for (N,), px.
     :ivar label: index of the line in the map (N,).
-    :ivar members: so many neighbours on a line, one after the other, are a group that shares what
-        is no shift; every line has whole groups.
+    :ivar members: how many neighbours on a line, one after the other, make a group, which shares
+        all that is not shift: floor, contrast, noise. Every line has whole groups.
     """
 
     centre: Array

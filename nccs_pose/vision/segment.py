@@ -54,7 +54,6 @@ _MOST = 150
 class Segmentation:
     """What in an image has the colour of a line.
 
-    :ivar mask: (H, W) uint8, 255 where it has.
     :ivar pixels: pixels (P, 2) of the blobs, u and v, at most a fixed number of each blob.
     :ivar place: of each in the mask, row by row (P,).
     :ivar label: blob of each (P,).
@@ -62,12 +61,11 @@ class Segmentation:
     :ivar pitch: side of what was one pixel when the blobs were found, px.
     """
 
-    mask: Mask
     pixels: Array
     place: NDArray[np.intp]
     label: NDArray[np.intp]
     weight: Array
-    pitch: int = 1
+    pitch: int
 
 
 def chromatic_mask(
@@ -195,5 +193,4 @@ def find_blobs(
     pixels[:, 0] = pitch * column + (origin[0] + middle)
     pixels[:, 1] = pitch * row + (origin[1] + middle)
     return Segmentation(
-        closed, pixels, place, label,
-        stride[label] * float(pitch * pitch), pitch)
+        pixels, place, label, stride[label] * float(pitch * pitch), pitch)
