@@ -70,6 +70,13 @@ GRID = LineMap((
     *(_line((x, -8.0), (x, 8.0), f'across {x}') for x in np.arange(-8.0, 8.5, 2.0))))
 
 
+def _plain(line_map: LineMap, width: int = 640) -> Scene:
+    """Lines on a textured floor, in even light and with nothing around."""
+    scene = arena_scene(width)
+    return replace(scene, line_map=line_map, appearance=replace(
+        scene.appearance, room=None, obstacles=(), light_gradient=(0.0, 0.0)))
+
+
 class Drive:
     """A robot that takes pictures and counts its wheels, in front of a localiser."""
 
@@ -886,6 +893,46 @@ def test_a_short_gap_without_wheels_costs_no_pose_on_a_symmetric_map(gap: float)
     drive.pose = drive.pose @ Pose2(0.03 * 10.0 * (gap - 0.1), 0.0, 0.03 * 10.0 * (gap - 0.1))
     for _ in range(3):
         assert drive.right(drive.go(step))
+
+
+@pytest.mark.parametrize('lines', [(2, 3), (0, 3)])
+@pytest.mark.parametrize('carried', [False, True])
+def test_one_foreign_image_does_not_stop_coasting_for_good(
+    lines: tuple[int, int], carried: bool,
+) -> None:
+    """Images that hide all but two lines agree with the wheels, unless the robot was carried."""
+    drive = Drive(_plain(SCENE.line_map), Pose2(0.1, -0.1, 0.3))
+    step = Pose2(0.02, 0.0, 0.02)
+    for _ in range(4):
+        assert drive.right(drive.go(step))
+    whole, shown = drive.scene, [drive.scene.line_map[k] for k in lines]
+    drive.scene = replace(whole, line_map=LineMap((
+        _line((-0.8, -1.0), (0.9, 0.6)), _line((-1.0, 0.7), (1.0, -0.2)))))
+    assert drive.go(step).state is State.LOST
+    drive.scene = replace(whole, line_map=LineMap(tuple(shown)))
+    slip = Pose2(0.3, 0.3, 0.4) if carried else STILL
+    states = [drive.go(step, slip).state] + [drive.go(step).state for _ in range(4)]
+    if carried:
+        assert State.COASTING not in states
+        return
+    assert states[1:] == [State.COASTING] * 4
+    drive.scene = whole
+    assert drive.right(drive.go(step))
+
+
+@pytest.mark.parametrize('wheels', [True, False])
+@pytest.mark.parametrize('low', [0.08, 0.10])
+def test_half_a_turn_on_a_nearly_symmetric_map_is_noticed(wheels: bool, low: float) -> None:
+    """All four lines are found where they were, though they lie badly."""
+    line_map = LineMap(_closed((-1.9, -1.3), (1.9, -1.3), (1.9, 1.3 - low), (-1.9, 1.3)))
+    drive = Drive(_plain(line_map), Pose2(0.3, -0.1, 0.4), wheels=wheels)
+    for _ in range(4):
+        assert drive.right(drive.go(Pose2(0.02, 0.0, 0.02)))
+    drive.pose = Pose2(0.0, 0.0, math.pi) @ drive.pose
+    for _ in range(2):
+        drive.go(Pose2(0.02, 0.0, 0.02))
+    for _ in range(3):
+        assert drive.right(drive.go(Pose2(0.02, 0.0, 0.02)))
 
 
 def test_a_pose_that_was_given_takes_up_wheels_that_come_later() -> None:

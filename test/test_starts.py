@@ -30,9 +30,9 @@ from nccs_pose.estimation.verdict import lines_used
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
-from nccs_pose.geometry.pose import Pose2
+from nccs_pose.geometry.pose import Pose2, RigidTransform
 from nccs_pose.simulation.renderer import render
-from nccs_pose.simulation.scene import arena_map, arena_scene, ideal_scene
+from nccs_pose.simulation.scene import arena_map, arena_scene, ideal_scene, Scene
 import numpy as np
 import pytest
 
@@ -71,9 +71,19 @@ def _in_pieces(line_map: LineMap, count: int, gap: float) -> LineMap:
 def _box(*more: tuple[tuple[float, float], tuple[float, float]]) -> LineMap:
     """A rectangle of tapes that looks the same after half a turn, and other tapes."""
     corners = [(-2.0, -1.4), (2.0, -1.4), (2.0, 1.4), (-2.0, 1.4)]
+    return _tapes(*zip(corners, corners[1:] + corners[:1]), *more)
+
+
+def _tapes(*ends: tuple[tuple[float, float], tuple[float, float]]) -> LineMap:
     return LineMap(tuple(
-        Line(np.array([*a, 0.0]), np.array([*b, 0.0]), width=0.05)
-        for a, b in (*zip(corners, corners[1:] + corners[:1]), *more)))
+        Line(np.array([*a, 0.0]), np.array([*b, 0.0]), width=0.05) for a, b in ends))
+
+
+def _plain(width: int, line_map: LineMap) -> Scene:
+    """Lines on a textured floor, in even light and with nothing around."""
+    scene = arena_scene(width)
+    return replace(scene, line_map=line_map, appearance=replace(
+        scene.appearance, room=None, obstacles=(), light_gradient=(0.0, 0.0)))
 
 
 MARKED = _box(((0.8, -1.4), (0.8, 1.4)))
@@ -115,6 +125,44 @@ def test_a_symmetric_map_drawn_in_pieces_gives_both_poses(count: int, gap: float
         assert len(estimate.candidates) == 2
         for twin in (pose, Pose2(0.0, 0.0, np.pi) @ pose):
             assert any(same_pose(c.pose, twin) for c in estimate.candidates)
+
+
+ZIGZAG = _tapes(
+    ((-1.6, -1.2), (-1.0, -0.2)), ((-1.0, -0.2), (-0.4, -1.2)), ((-0.4, -1.2), (0.2, -0.2)),
+    ((0.2, -0.2), (0.8, -1.2)), ((0.8, -1.2), (1.4, -0.2)), ((-1.5, 1.2), (1.2, 1.3)))
+JOINTS = _tapes(
+    ((-2.0, -1.4), (2.0, -1.4)), ((-2.0, -1.4), (-2.0, 1.4)), ((0.6, -1.4), (0.6, 1.0)),
+    ((-2.0, 0.4), (1.6, 0.4)), ((1.6, -0.5), (1.6, 1.4)))
+CORNERS = ((-1.9, -1.2), (0.2, -1.6), (1.9, -0.7), (1.5, 1.2), (-0.4, 1.5), (-1.7, 0.8))
+HEXAGON = _tapes(*zip(CORNERS, CORNERS[1:] + CORNERS[:1]))
+
+
+@pytest.mark.parametrize(('line_map', 'pose', 'leans', 'seed'), [
+    (ZIGZAG, Pose2(0.14455, -0.59423, 2.38542), (-0.006438, -0.002748), (0, 5)),
+    (JOINTS, Pose2(-0.57877, 0.48093, 2.09913), (-0.004842, -0.005055), (1, 29)),
+    (HEXAGON, Pose2(0.68751, 0.42294, -1.40195), (-0.006601, 0.002331), (1, 12))])
+def test_a_leaning_robot_is_not_taken_for_one_elsewhere(
+    line_map: LineMap, pose: Pose2, leans: tuple[float, float], seed: tuple[int, int],
+) -> None:
+    """The image speaks against the right pose, but shows more of it than of any other."""
+    scene = _plain(640, line_map)
+    mounted, lean = scene.rig.T_base_mirror, RigidTransform.from_rpy(
+        np.array([*leans, 0.0]), np.zeros(3))
+    leaning = replace(scene, rig=replace(scene.rig, T_base_mirror=lean @ mounted))
+    image = render(leaning, pose, np.random.default_rng(seed))
+    estimate = Localiser(scene.rig, line_map).process(0, image)
+    assert estimate.pose is None
+    # Where leaning is reckoned with, the right pose holds.
+    told = Localiser(scene.rig, line_map, LocaliserOptions(tilt_sigma=0.01)).process(0, image)
+    assert any(same_pose(c.pose, pose) for c in told.candidates)
+
+
+def test_a_corner_of_a_small_image_is_not_taken_for_another() -> None:
+    """Two of its lines lie as well half a turn round, and strips show as much of both."""
+    scene, pose = _plain(320, arena_map()), Pose2(0.61199, 0.77756, 1.69380)
+    image = render(scene, pose, np.random.default_rng([0, 36, 1]))
+    estimate = Localiser(scene.rig, scene.line_map).process(0, image)
+    assert estimate.pose is None or same_pose(estimate.pose, pose)
 
 
 def test_pieces_of_a_line_are_not_two_lines_wide_enough() -> None:

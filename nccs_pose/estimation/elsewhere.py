@@ -21,6 +21,8 @@ from itertools import islice
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.association import Candidates
+from nccs_pose.estimation.case import SEARCH_BAND
+from nccs_pose.estimation.judge import fit_of
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
 from nccs_pose.estimation.motion import Prediction
@@ -28,7 +30,7 @@ from nccs_pose.estimation.observability import COINCIDENT
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
 from nccs_pose.estimation.told import BETTER, Told
-from nccs_pose.estimation.verdict import contradiction, Objection
+from nccs_pose.estimation.verdict import contradiction, is_suspect, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
@@ -41,6 +43,10 @@ _TRIED = 4
 # A place where the robot may be lies within so many deviations of a vague prediction: what that
 # reckons with is the most that a robot does, not what it happens to do.
 _GATE = 3.0
+# Lines lie better elsewhere if they explain so much more there, counting how well they lie.
+_FITS_BETTER = 0.05
+FITS_ELSEWHERE = Objection('its lines lie better on another pose')
+"""What is said against an expected pose that may be another one of a map nearly symmetric."""
 _ANOTHER = Objection('another pose explains the image better')
 _AS_WELL = Objection('another place where the robot may be by now explains the image as well')
 
@@ -79,6 +85,9 @@ class Elsewhere:
         against = contradiction(alignment, segments, self._map)
         if against is not None:
             return Refused(against, alignment)
+        if is_suspect(alignment) and self._fits_better(image, alignment, segments):
+            # Without the alignment, which others would have to beat by what they explain.
+            return Refused(FITS_ELSEWHERE)
         vague = prediction.is_vague
         here, _ = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
@@ -95,6 +104,20 @@ class Elsewhere:
             # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
+
+    def _fits_better(
+        self, image: NDArray[np.uint8], alignment: Alignment, segments: Strips,
+    ) -> bool:
+        """Whether the lines lie better on a place from where the map looks nearly the same."""
+        here = alignment.explained * fit_of(alignment.points.variance)
+        for place in self._searcher.taken_for(alignment.pose, segments):
+            other = self._aligner.align(
+                image, place.pose, alignment.colours, reach=SEARCH_BAND)
+            if other is None or same_pose(other.pose, alignment.pose):
+                continue
+            if other.explained * fit_of(other.points.variance) > here + _FITS_BETTER:
+                return True
+        return False
 
     def _shows_as_much(
         self, found: Candidates, alignment: Alignment, here: float, told: Told,

@@ -25,6 +25,7 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.stopwatch import Stopwatch
+from nccs_pose.estimation.verdict import is_suspect
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.vision.colour import LineColour
 import numpy as np
@@ -76,12 +77,14 @@ class Follower:
             return refused
         self._frames_since_check += 1
         due = self._frames_since_check >= self._options.check_every
-        if not (due or prediction.is_vague or alignment.missing or len(alignment.lines) == 1):
+        suspect = is_suspect(alignment)
+        if not (due or suspect or prediction.is_vague or alignment.missing
+                or len(alignment.lines) == 1):
             return Found(alignment, float('nan'), alignment.explained)
         masks = self._searcher.masks(image)
         claimed = self._searcher.on_lines(alignment.pose, masks)
         watch.lap('detect')
-        if prediction.is_vague or self._elsewhere.leaves_room(alignment, claimed):
+        if suspect or prediction.is_vague or self._elsewhere.leaves_room(alignment, claimed):
             segments = self._searcher.strips(masks)
             watch.lap('detect')
             elsewhere = self._elsewhere.refused(image, alignment, prediction, segments)

@@ -103,6 +103,8 @@ class Ledger:
         self._settled: list[Pose2] = []
         self._held: list[Found] = []
         self._refused: list[Refused] = []
+        # The most that the image shows of a pose that it speaks against.
+        self._most_refused = 0.0
         self._hidden: list[Candidate] = []
         # What would hold, if something hid what they miss.
         self._excused: list[Found] = []
@@ -190,23 +192,27 @@ class Ledger:
         self._refused.append(Refused(against, shown.alignment))
         self._doubtful.append(shown)
 
-    def refuse(self, against: Objection, alignment: Alignment) -> None:
+    def refuse(self, against: Objection, shown: Found) -> None:
         """Note a pose that does not hold."""
-        self._laid.append(alignment.pose)
-        self._settle_twins(alignment.pose)
-        self._refused.append(Refused(against, alignment))
+        pose = shown.alignment.pose
+        self._laid.append(pose)
+        self._settle_twins(pose)
+        self._refused.append(Refused(against, shown.alignment))
+        self._most_refused = max(self._most_refused, shown.shown)
 
     def hide(self, against: Objection, shown: Found) -> None:
         """Note a pose that would hold, if something hid the lines that it misses."""
         pose = shown.alignment.pose
-        self.refuse(against, shown.alignment)
+        self.refuse(against, shown)
         alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
         self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
         self._excused.append(shown)
 
     def closed(self) -> Sifted:
         """What is left when no more poses are laid on the image."""
-        held = _ranked(self._held)
+        # Where the image shows more of a pose that it speaks against, it is the right one, and the
+        # rig or the map is off: the robot leans, or a line was moved.
+        held = _ranked([f for f in self._held if f.shown + AS_MUCH >= self._most_refused])
         if not held:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
         best, poses = held[0], [f.alignment.pose for f in held]

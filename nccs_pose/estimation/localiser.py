@@ -32,9 +32,10 @@ from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import OPEN
 from nccs_pose.estimation.case import Case
-from nccs_pose.estimation.coasting import may_coast, shows_another_place
+from nccs_pose.estimation.coasting import may_coast, shows_another_place, shows_this_place
 from nccs_pose.estimation.course import Course
 from nccs_pose.estimation.decision import left_open, may_show, the_one_expected
+from nccs_pose.estimation.elsewhere import FITS_ELSEWHERE
 from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.frame import Frame
@@ -142,6 +143,8 @@ class Localiser:
         self._ever_tracked = False
         # Whether an image has shown another place than expected since the last pose.
         self._shaken = False
+        # Images in a row that agree with what is expected, but hide too much to give a pose.
+        self._agreeing = 0
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -218,6 +221,10 @@ class Localiser:
 
         :param refused: what came of following the robot to the image.
         """
+        is_first = frame.prediction is None and not self._open
+        if refused.objection is FITS_ELSEWHERE:
+            # A pose is no longer believed for being expected.
+            frame = replace(frame, prediction=None)
         given = None if self._given is None else self._given.expected(
             frame.stamp_ns, frame.wheels)
         told = self._told(given or frame.prediction)
@@ -244,24 +251,24 @@ class Localiser:
             words = _FOUND if len(held) == 1 else (
                 'several poses explain the image; the one expected was taken')
             return self._tracking(frame, chosen, words, held=held)
-        return self._decided(frame, held, sifted, told, hypotheses)
+        return self._decided(frame, held, sifted, told, hypotheses, is_first)
 
     def _decided(
         self, frame: Frame, held: list[Found], sifted: Sifted, told: Told | None,
-        before: Sequence[Hypothesis],
+        before: Sequence[Hypothesis], is_first: bool,
     ) -> Estimate:
         """Decide between poses by all images since they were first seen, or leave them open.
 
         :param held: those that explain this image, best first.
         :param sifted: what else the search of it left.
         :param before: those that the images before left open, where they are by now.
+        :param is_first: whether nothing was expected of the image; else two have to agree.
         """
-        first = frame.prediction is None and not self._open
         hypotheses, more = left_open(before, held, sifted)
         self._open = OpenPoses(hypotheses, frame.stamp_ns, frame.wheels)
         best = hypotheses[0]
         if ambiguity(hypotheses) <= self._options.ambiguity_ratio and (
-                first or len(best.scores) >= LEAST_IMAGES):
+                is_first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(frame, found, _FOUND, held=held)
         if told is not None and not may_show(told, held, sifted):
@@ -335,7 +342,7 @@ class Localiser:
         if prior is None:
             self._follower.begin()
         self._open, self._given, self._refuted_ns = OpenPoses(), None, None
-        self._shaken, self._ever_tracked = False, True
+        self._shaken, self._agreeing, self._ever_tracked = False, 0, True
         return answers.tracking(frame, reason, held or [found], found, covariance, unobserved)
 
     def _without_pose(self, frame: Frame, sight: Sight, refused: Refused) -> Estimate:
@@ -348,6 +355,11 @@ class Localiser:
         if prediction is not None:
             self._shaken |= contradicted or bool(self._open) or shows_another_place(
                 sight, prediction, self._searcher)
+            agrees = not (self._open or self._history.doubted) and shows_this_place(
+                sight, prediction, refused.alignment, self._searcher, self._options)
+            self._agreeing = self._agreeing + 1 if agrees else 0
+            if self._agreeing >= LEAST_IMAGES:
+                self._shaken = False
         missing = what_is_missing(sight.segments) if against is None else against.words
         doubted = None if refused.alignment is None else Doubted(
             refused.alignment.pose, refused.alignment.points)

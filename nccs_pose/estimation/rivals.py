@@ -99,9 +99,10 @@ class Rivals:
             return None
         if few and not sharp:
             return _TWO_COARSE
-        rivals = self._by_strips(found, candidates)
         if sharp:
-            return _ON_A_CORNER if rivals else None
+            alike = self._searcher.taken_for(alignment.pose, case.sight.segments)
+            return _ON_A_CORNER if self._by_strips(found, (*candidates, *alike)) else None
+        rivals = self._by_strips(found, candidates)
         if rivals and not plain:
             return _DOUBTFUL
         least_score = self._options.ambiguity_ratio * found.score if plain else 0.0

@@ -28,7 +28,6 @@ from nccs_pose.estimation.ledger import Ledger, Sifted
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.rivals import DOUBTS, Rivals
-from nccs_pose.estimation.sights import Sight
 from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 
@@ -116,12 +115,13 @@ class Sifter:
         alignment, found = verdict
         if isinstance(found, Found):
             return found
+        shown = self._judge.measured(alignment, case.sight.segments, start.kept(alignment.pose))
         if found in DOUBTS:
-            ledger.doubt(found, self._measured(case.sight, start, alignment))
+            ledger.doubt(found, shown)
         elif found.hidden:
-            ledger.hide(found, self._measured(case.sight, start, alignment))
+            ledger.hide(found, shown)
         else:
-            ledger.refuse(found, alignment)
+            ledger.refuse(found, shown)
         return alignment
 
     def _is_undecided(self, case: Case, ledger: Ledger) -> bool:
@@ -182,10 +182,6 @@ class Sifter:
 
     def _expected(self, case: Case, alignment: Alignment) -> bool:
         return is_expected(alignment, case.prediction, self._options.innovation_gate)
-
-    def _measured(self, sight: Sight, start: Start, alignment: Alignment) -> Found:
-        """How much a pose explains that was refused."""
-        return self._judge.measured(alignment, sight.segments, start.kept(alignment.pose))
 
     def _unless_doubtful(
         self, case: Case, ledger: Ledger, found: Found | Objection, expected: bool,

@@ -42,6 +42,8 @@ DISTURBED = 0.28
 # lines are other ones than thought, or not seen by this rig: of two lines, of three, and of more
 # where no prediction agrees.
 _UNLIKE_NOISE = ((5.0, 0.0), (3.0, 0.3), (3.0, 0.4))
+# The same of a pose that is believed, where another place may explain them.
+_SUSPECT = (2.0, 0.3)
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,12 @@ def is_weak(alignment: Alignment) -> bool:
     scale, size = alignment.scale, alignment.residual_px
     times, least = _UNLIKE_NOISE[1]
     return lines_used(alignment) < 3 or (scale > times and size > least)
+
+
+def is_suspect(alignment: Alignment) -> bool:
+    """Whether an expected pose fits so badly that the map may look nearly the same elsewhere."""
+    times, least = _SUSPECT
+    return alignment.scale > times and alignment.residual_px > least
 
 
 def _line_off(alignment: Alignment, lines: int, most: float) -> tuple[int, float] | None:
