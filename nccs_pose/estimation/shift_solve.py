@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
-from nccs_pose.estimation.common_errors import common_variance
+from nccs_pose.estimation.common_errors import common_variance, sums_of_neighbours
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.robust import CAUCHY, GATE, robust_variance, VAGUE_INFORMATION
 from nccs_pose.geometry.pose import Array, Pose2
@@ -58,7 +58,7 @@ class WeighedShifts:
     :ivar root: of the weights (N,).
     :ivar inlier: which the pose rests on (N,).
     :ivar label: map line of each (N,).
-    :ivar first: the first of each group of neighbours (G,).
+    :ivar first: the first of each sum of neighbours whose errors are looked at together (G,).
     :ivar known: information about the unknowns beforehand (K, K).
     :ivar told: that times what is expected of them (K,).
     :ivar image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift
@@ -161,7 +161,8 @@ def weigh_shifts(
     if calibration_sigma > 0.0 and image_shift is not None:
         image_sigma = calibration_sigma * image_shift
     return WeighedShifts(
-        start, free, rows[:-1], sigma, root, inlier, label, first, known, told, image_sigma)
+        start, free, rows[:-1], sigma, root, inlier, label, sums_of_neighbours(first, label),
+        known, told, image_sigma)
 
 
 def _robust(equations: Array, known: Array, told: Array) -> Array:
