@@ -247,7 +247,8 @@ class Aligner:
             if 0.0 < reach <= LINEAR_PX and measured.moved > _ASTRAY_PX:
                 return None
             near = measured.moved < LINEAR_PX
-            if followed and near:
+            # Of a step within the blur a rough pass misses less than settled poses may differ by.
+            if followed and near and measured.moved > sharpest:
                 measured = self._measurer.measure_again(look, measured)
             # What profiles bear needs no bands of its own.
             leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest

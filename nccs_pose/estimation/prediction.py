@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 import itertools
 import math
 
@@ -66,7 +67,7 @@ class Places:
     def __len__(self) -> int:
         return len(self.number)
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Of curve that all of them stand for, px."""
         return float(self.spacing.sum())

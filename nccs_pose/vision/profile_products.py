@@ -116,7 +116,7 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 def profile_products(
     channels: NDArray[np.uint8] | NDArray[np.float32], s: NDArray[np.float32], half_width: Array,
     across: Array, blur: float, members: int,
-) -> tuple[Array, NDArray[np.float32], Array]:
+) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]]:
     """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)

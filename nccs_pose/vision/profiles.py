@@ -241,7 +241,8 @@ def _eliminated(pooled: Array, size: int) -> _System:
     total, swept = pooled[:, -1], np.empty((columns + 2, columns, groups))
     rest, means, both, shares = swept[:-2], swept[-2], swept[:-1], swept[-1]
     np.divide(total, size, out=means)
-    np.subtract(pooled[:, :-1], means[:, None] * total, out=rest)
+    np.multiply(means[:, None], total, out=rest)
+    np.subtract(pooled[:, :-1], rest, out=rest)
     power = np.maximum(rest[0, 0], 1e-9)
     np.divide(rest[0], power, out=shares)
     both -= both[:, :1] * shares
