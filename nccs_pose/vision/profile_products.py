@@ -196,25 +196,26 @@ def _edgeworth(
     :param bell: exp(-x^2 / 2) of them.
     """
     cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
-    share = (cumulant / -24.0).astype(np.float32)[:, None] * bell
     square, added = np.square(edges), np.empty((3, *edges.shape[1:]), np.float32)
     three, six, ten, fifteen = np.array([3.0, 6.0, 10.0, 15.0], np.float32)
     # All in one place, which the processor has at hand: He3, He4 and He5.
     value = square - three
     value *= edges
-    value *= share * np.float32(1.0 / math.sqrt(2.0 * math.pi))
+    value *= bell
     np.subtract(value[0], value[1], out=added[0])
+    added[0] *= np.float32(1.0 / math.sqrt(2.0 * math.pi))
     np.subtract(square, six, out=value)
     value *= square
     value += three
-    value *= share
+    value *= bell
     np.subtract(value[0], value[1], out=added[1])
     np.subtract(square, ten, out=value)
     value *= square
     value += fifteen
     value *= edges
-    value *= share
+    value *= bell
     np.subtract(value[0], value[1], out=added[2])
+    added *= (cumulant / -24.0).astype(np.float32)[:, None]
     return added
 
 
