@@ -165,17 +165,18 @@ class Aligner:
                     and (steady or measured.alignment.is_sharp) and leaves_open(result)) or (
                     k > 0 and steady and measured.moved < _NEARLY
                     and hopeless(measured.alignment))
-            # Stations that come and go near their thresholds can keep it stepping to and fro: it
-            # ends as the last pass would.
-            returns = steady and close(result.pose, before, result.covariance, _SETTLED)
-            before, pose, attitude = pose, result.pose, result.attitude
             if settled:
                 return measured.alignment
             # Measured again, it misses that part of that part.
             if reach == 0.0 and steady and measured.moved < _SLIDING_PX and close(
-                    pose, before, result.covariance, _FOLLOWED / part**2):
+                    result.pose, pose, result.covariance, _FOLLOWED / part**2):
                 return self._measurer.measure_again(look, measured).alignment
-            if returns and (_ITERATIONS - k) % 2 == 1:
+            # Stations that come and go near their thresholds can keep it stepping to and fro: it
+            # ends as the last pass would.
+            returns = (_ITERATIONS - k) % 2 == 1 and steady and close(
+                result.pose, before, result.covariance, _SETTLED)
+            before, pose, attitude = pose, result.pose, result.attitude
+            if returns:
                 break
             if measured.moved > _MOVED_PX:
                 places = self._places(pose)
