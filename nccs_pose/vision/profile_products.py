@@ -54,7 +54,7 @@ class Reading(NamedTuple):
     rows: int
 
     def along(self, weights: Array) -> NDArray[np.float32]:
-        """The sum of the channels by weights (3,) (1, N, P)."""
+        """What the channels come to together, by weights (3,): (1, N, P)."""
         return cv2.transpose(cv2.transform(self.values.astype(np.float32), weights[None]))[None]
 
 
