@@ -18,7 +18,11 @@ from __future__ import annotations
 
 import math
 
-from nccs_pose.estimation.common_errors import common_misfit, common_variance
+from nccs_pose.estimation.common_errors import (
+    common_misfit,
+    common_variance,
+    sums_of_neighbours,
+)
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -96,7 +100,8 @@ def test_what_a_tile_shares_counts_in_a_fine_image_too(share: float) -> None:
     along = np.tile(np.linspace(-1.0, 1.0, per_line), LINES)
     pose = np.linalg.qr(np.stack([
         1.0 * (label == 0) - (label == 2), 1.0 * (label == 1) - (label == 3), along], axis=1))[0]
-    leverage, first = np.square(pose).sum(axis=1), np.arange(0, len(label), 6)
+    leverage = np.square(pose).sum(axis=1)
+    first = sums_of_neighbours(np.arange(0, len(label), 6), label)
     rng, squares = np.random.default_rng(3), []
     for _ in range(600):
         own = rng.standard_normal((LINES, per_line))

@@ -192,10 +192,11 @@ class Aligner:
                 return self._measurer.measure_again(look, measured).alignment
             # Stations that come and go near their thresholds can keep it stepping to and fro
             # between two poses: it stops at the one where the last of all passes would end.
-            returns = steady and close(pose, before, covariance, _SETTLED)
+            returns = (_ITERATIONS - k) % 2 == 1 and steady and close(
+                pose, before, covariance, _SETTLED)
             last, before, state = measured, state.pose, _State(
                 pose, measured.refinement.attitude, measured.colours, state.is_tried)
-            if returns and (_ITERATIONS - k) % 2 == 1:
+            if returns:
                 break
             if measured.moved > _MOVED_PX:
                 places = self._places(pose)
@@ -266,7 +267,8 @@ class Aligner:
             if 0.0 < reach <= LINEAR_PX and measured.moved > _ASTRAY_PX:
                 return None
             near = measured.moved < LINEAR_PX
-            if followed and near:
+            # Of a step within the blur a rough pass misses less than settled poses may differ by.
+            if followed and near and measured.moved > sharpest:
                 measured = self._measurer.measure_again(look, measured)
             # A lean so small that profiles bear it needs no bands of its own.
             leans = np.abs(measured.leant).max() > _SETTLED_BLURS * sharpest

@@ -43,8 +43,7 @@ def common_variance(
 
     Neighbours err alike where a texture or a block of JPEG spans several, and against each other
     where the pixels' grid lies on the template in turns. The sums of whole groups of neighbours
-    hold all of that, however far it reaches within them; of small groups, in a fine image, several
-    together.
+    hold all of that, however far it reaches within them; see :func:`sums_of_neighbours`.
 
     Errors weigh what they do in the fit. A near tape tells most of a pose, and compared with the
     noise told it may err more than a far one (coarse JPEG, whose far tapes are all template) or
@@ -66,14 +65,13 @@ def common_variance(
     :param leverage: how far each one's error moves its own fit (N,), from 0 to 1; 0 of one that
         has no part in it.
     :param label: line (N,), ascending.
-    :param first: station of each group (G,), ascending from 0; no group is of two lines.
+    :param first: station of each sum (G,), ascending from 0; none is of two lines.
     :returns: 1 for independent errors as large as told.
     """
     weighed = np.empty((2, len(residual)))
     error = np.sqrt(leverage, out=weighed[0])
     error *= residual
     weighed[1] = leverage
-    first = _of_several(first, label)
     sums, shares = np.add.reduceat(weighed, first, axis=1)
     fitted, shared = max(float(shares.sum()), 1e-12), _square(shares)
     left = max(fitted - shared, 0.0)
@@ -96,8 +94,14 @@ def common_variance(
     return together * math.exp(_REDDER * square + 0.5 * _REDDER**2 * scatter)
 
 
-def _of_several(first: NDArray[np.intp], label: NDArray[np.intp]) -> NDArray[np.intp]:
-    """First stations of about _SUMS groups, each of as many of those given on one line."""
+def sums_of_neighbours(
+    first: NDArray[np.intp], label: NDArray[np.intp],
+) -> NDArray[np.intp]:
+    """First stations of about _SUMS sums; of small groups, in a fine image, each is of several.
+
+    :param first: station of each group (G,), ascending from 0; no group is of two lines.
+    :param label: line of the stations (N,), ascending.
+    """
     several = round(len(first) / _SUMS)
     if several < 2:
         return first

@@ -181,15 +181,15 @@ def misplaced(
     :param offsets: likewise (K,), metres.
     :param of: the line of each point (P,).
     """
-    by_floor = np.column_stack([normals, -offsets]).take(of, axis=0)
-    off = np.einsum('pi,pi->p', points.floor, by_floor)
-    return np.abs(off) > half_strip(
-        width, footprints(points.spread, normals.take(of, axis=0)))
+    own = normals.take(of, axis=0)
+    off = np.einsum('pi,pi->p', points.floor[:, :2], own) - offsets.take(of)
+    return np.abs(off) > half_strip(width, footprints(points.spread, own))
 
 
 def footprints(spread: Array, normals: Array) -> Array:
     """How far pixels of spreads (P, 3) reach along normals of their own (P, 2), metres (P,)."""
-    return np.sqrt(np.einsum('pi,pi->p', spread, squares(normals) * [1.0, 2.0, 1.0]))
+    (x, y), (xx, xy, yy) = normals.T, spread.T
+    return np.sqrt(xx * (x * x) + 2.0 * xy * (x * y) + yy * (y * y))
 
 
 def half_strip(width: float, footprint: Array) -> Array:
@@ -202,22 +202,17 @@ def _half(width: float) -> float:
     return 0.5 * width + 0.005
 
 
-def squares(points: Array) -> Array:
-    """xx, xy and yy of points (N, 2) as (N, 3)."""
-    x, y = points[:, 0], points[:, 1]
-    return np.stack([x * x, x * y, y * y], axis=1)
-
-
 def principal_lines(moments: Array) -> tuple[Array, Array, Array]:
     """Total least squares lines.
 
     :param moments: summed over each one's points (K, 6); see :attr:`FloorPoints.moments`.
     :returns: unit normals (K, 2), offsets (K,) and the points' mean square distances (K,), m^2.
     """
-    mean = moments[:, 1:3] / moments[:, :1]
-    xx, xy, yy = (moments[:, 3:] - moments[:, :1] * squares(mean)).T
+    total, x, y, xx, xy, yy = moments.T
+    x, y = x / total, y / total
+    xx, xy, yy = xx - total * (x * x), xy - total * (x * y), yy - total * (y * y)
     # Direction of the larger principal axis of a 2 x 2 covariance, in closed form.
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    minor = 0.5 * (xx + yy - np.hypot(2.0 * xy, xx - yy)) / moments[:, 0]
-    return normal, np.einsum('ki,ki->k', normal, mean), minor
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    minor = 0.5 * (xx + yy - np.hypot(2.0 * xy, xx - yy)) / total
+    return normal.T, normal[0] * x + normal[1] * y, minor

@@ -163,7 +163,7 @@ class Measurer:
             missed[part.groups] = np.where(found, shift - shared[part.groups], 0.0)
         # What was missed is a part of the way.
         most = _MOST_MISSED * np.abs(beside)
-        shift = fit.shift + np.clip(missed.repeat(bands.members), -most, most)
+        shift = fit.shift + np.minimum(np.maximum(missed.repeat(bands.members), -most), most)
         return self._pass(
             look, first.weighed, replace(fit, shift=shift), first.used, tuple(colours))
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 import itertools
 import math
 
@@ -33,6 +34,7 @@ from numpy.typing import NDArray
 _SHARED_PX = 16.0
 # Coarse samples of what is in reach of each line; between them its image is interpolated.
 _COARSE = 32
+_EVENLY = np.linspace(0.0, 1.0, _COARSE)
 _SLOPE = 1e-9
 # A tape's end is no edge: keep this much away from it, px.
 _END = 3.0
@@ -65,7 +67,7 @@ class Places:
     def __len__(self) -> int:
         return len(self.number)
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Of curve that all of them stand for, px."""
         return float(self.spacing.sum())
@@ -206,9 +208,10 @@ class BandPredictor:
         """
         to_foot = (complex(*self._table.foot) - origin) * (self._direction * turn).conj()
         half_chord = np.sqrt(np.maximum(self._table.reach**2 - to_foot.imag**2, 0.0))
-        first = np.clip(to_foot.real - half_chord, 0.0, self._length)
-        last = np.clip(to_foot.real + half_chord, 0.0, self._length)
-        return first[:, None] + np.linspace(0.0, 1.0, _COARSE) * (last - first)[:, None]
+        first, last = (
+            np.minimum(np.maximum(end, 0.0), self._length)
+            for end in (to_foot.real - half_chord, to_foot.real + half_chord))
+        return first[:, None] + _EVENLY * (last - first)[:, None]
 
     def _gaps(self, parts: NDArray[np.intp], whole: NDArray[np.intp]) -> Array:
         """Floor between a tape's edge and the next tape, metres, along one tape after the other.

@@ -22,9 +22,9 @@ pose; who predicts again at the pose found makes it exact.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
-from nccs_pose.estimation.common_errors import common_variance
+from nccs_pose.estimation.common_errors import common_variance, sums_of_neighbours
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.robust import CAUCHY, GATE, robust_variance, VAGUE_INFORMATION
 from nccs_pose.geometry.pose import Array, Pose2
@@ -58,7 +58,7 @@ class WeighedShifts:
     :ivar root: of the weights (N,).
     :ivar inlier: which the pose rests on (N,).
     :ivar label: map line of each (N,).
-    :ivar first: the first of each group of neighbours (G,).
+    :ivar first: the first of each sum of neighbours whose errors are looked at together (G,).
     :ivar known: information about the unknowns beforehand (K, K).
     :ivar told: that times what is expected of them (K,).
     :ivar image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift
@@ -82,19 +82,14 @@ class WeighedShifts:
 
         :param shift: those that were weighed, px, or what they turn out to be.
         """
-        weighed, right_side = self.rows * self.root, shift / self.sigma
-        normal = weighed.dot(weighed.T)
+        weighed, normal, fitted, leverage, held = self._fit
+        right_side = shift / self.sigma
         right = weighed.dot(right_side * self.root)
         # The prior's share is weighed against residuals of the size that they have.
-        one = _ONE[:len(self.free), :len(self.free)]
-        fitted = definite_solution(normal + self.known, one)
         e = (right_side - fitted.dot(right + self.told).dot(self.rows)) * self.root
-        leverage = (fitted.dot(weighed) * weighed).sum(axis=0)
-        # Of the biweight, psi' over the weight is 5 - 4 / root.
-        held = max(
-            5.0 - 4.0 * leverage.dot(1.0 / self.root) / max(leverage.sum(), 1e-12), _LEAST_HELD)
         inflation = max(common_variance(e, leverage, self.label, self.first) / held**2, 1e-6)
-        covariance = definite_solution(normal / inflation + self.known, one)
+        covariance = definite_solution(
+            normal / inflation + self.known, _ONE[:len(self.free), :len(self.free)])
         unknowns = covariance @ (right / inflation + self.told)
         if self.image_sigma is not None:
             moved = self.image_sigma * (self.root / self.sigma)[:, None]
@@ -107,6 +102,23 @@ class WeighedShifts:
             Pose2(self.start.x + x, self.start.y + y, self.start.yaw + yaw),
             0.5 * (covariance + covariance.T)[:3, :3], normal[:3, :3], step[3:],
             right_side - unknowns.dot(self.rows), self.inlier, True)
+
+    @cached_property
+    def _fit(self) -> tuple[Array, Array, Array, Array, float]:
+        """What a fit has whatever the shifts are.
+
+        :returns: the rows, weighed (K, N); their normal matrix (K, K); with what is known
+            beforehand, the inverse of that; how far each shift's error moves its own fit (N,); and
+            by which part of its weights the fit is held.
+        """
+        weighed = self.rows * self.root
+        normal = weighed.dot(weighed.T)
+        fitted = definite_solution(
+            normal + self.known, _ONE[:len(self.free), :len(self.free)])
+        leverage = (fitted.dot(weighed) * weighed).sum(axis=0)
+        # Of the biweight, psi' over the weight is 5 - 4 / root.
+        held = 5.0 - 4.0 * leverage.dot(1.0 / self.root) / max(leverage.sum(), 1e-12)
+        return weighed, normal, fitted, leverage, max(float(held), _LEAST_HELD)
 
 
 def weigh_shifts(
@@ -161,7 +173,8 @@ def weigh_shifts(
     if calibration_sigma > 0.0 and image_shift is not None:
         image_sigma = calibration_sigma * image_shift
     return WeighedShifts(
-        start, free, rows[:-1], sigma, root, inlier, label, first, known, told, image_sigma)
+        start, free, rows[:-1], sigma, root, inlier, label, sums_of_neighbours(first, label),
+        known, told, image_sigma)
 
 
 def _robust(equations: Array, known: Array, told: Array) -> Array:

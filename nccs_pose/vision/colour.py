@@ -107,8 +107,8 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter.dot(scatter))) / total:
             return self
-        good = along > 0.3 * max(upper_median(along), 0.0)
-        count = np.count_nonzero(good)
+        good = (along > 0.3 * max(upper_median(along), 0.0)).astype(float)
+        count = float(good.sum())
         if count < 10:
             return self
         weight = power * good

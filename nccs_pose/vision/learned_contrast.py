@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import cv2
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.segment import Mask
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 # the most extreme of the others, which are things and not floor.
 _SPARSE = 3
 _NEAR = np.ones((9, 9), np.uint8)
-_ORDINARY = 90.0
+_ORDINARY = 0.9
 # Rounding and compression, grey levels^2.
 _ROUNDING = 4.0
 
@@ -57,11 +58,14 @@ def learned_colour(
     if len(clutter) == 0:
         return colour
     size = np.square(clutter).sum(axis=1)
-    clutter = clutter[size <= np.percentile(size, _ORDINARY)]
+    last = int(_ORDINARY * (len(size) - 1))
+    clutter = clutter[size <= np.partition(size, last)[last]]
+    # Of numbers shorter than 32 bits numpy finds the median in twice the time.
+    usual = image[::_SPARSE, ::_SPARSE][sparse].astype(np.int32)
     return colour.taught(
         values[tape].mean(axis=0).astype(float),
         clutter.T @ clutter / len(clutter) + _ROUNDING * np.eye(3),
-        np.median(image[::_SPARSE, ::_SPARSE][sparse], axis=0))
+        np.array([upper_median(channel) for channel in usual.T]))
 
 
 def feature_of(image: NDArray[np.uint8], colour: LineColour) -> Mask:

@@ -43,7 +43,7 @@ class Reading(NamedTuple):
     """The pixels nearest to a grid of P points over each of N bands.
 
     :ivar values: BGR (P, N, 3).
-    :ivar place: of the pixels across the curve (P, N), px.
+    :ivar place: of the pixels across the curve (N, P), px.
     :ivar margin: of floor beyond the edges that the grid covers, px.
     :ivar rows: of the grid along each station's piece of curve.
     """
@@ -52,6 +52,10 @@ class Reading(NamedTuple):
     place: NDArray[np.float32]
     margin: float
     rows: int
+
+    def along(self, weights: Array) -> NDArray[np.float32]:
+        """What the channels come to together, by weights (3,): (1, N, P)."""
+        return cv2.transpose(cv2.transform(self.values.astype(np.float32), weights[None]))[None]
 
 
 def read_pixels(
@@ -87,7 +91,7 @@ def read_pixels(
     at *= terms[4]
     s = np.square(at.imag)
     s *= bend.astype(np.float32)
-    return Reading(values, np.subtract(at.real, s, out=s), margin, rows)
+    return Reading(values, cv2.transpose(np.subtract(at.real, s, out=s)), margin, rows)
 
 
 @cache
@@ -110,9 +114,9 @@ def as_complex(points: Array) -> NDArray[np.complex64]:
 
 
 def profile_products(
-    pixels: NDArray[np.uint8], s: NDArray[np.float32], half_width: Array, across: Array,
-    blur: float, members: int,
-) -> tuple[Array, NDArray[np.float32], Array]:
+    channels: NDArray[np.uint8] | NDArray[np.float32], s: NDArray[np.float32], half_width: Array,
+    across: Array, blur: float, members: int,
+) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]]:
     """What stations and groups say, in the products of templates and image with each other.
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
@@ -125,22 +129,22 @@ def profile_products(
     has hardly any. Otherwise a tape along the pixels' grid would seem to lie up to 0.06 px off,
     to and fro as it passes from row to row.
 
-    :param pixels: (P, N, 3) BGR.
-    :param s: their place across the curve (P, N), px.
+    :param channels: of the pixels (C, N, P), three or what they come to together.
+    :param s: place of the pixels across the curve (N, P), px.
     :param half_width: of the tape (N,), px.
     :param across: unit normal of the curve (N, 2).
     :param blur: standard deviation of the edges' blur, px.
     :param members: stations of each group, one after the other.
-    :returns: products of T, D, s, B and the three channels with each other and with 1, summed
-        over each group (7, 8, G); all of them and 1 by stations (8, N, P); and the colour (3,)
+    :returns: products of T, D, s, B and the channels with each other and with 1, summed over each
+        group (4 + C, 5 + C, G); all of them and 1 by stations (5 + C, N, P); and the colour (C,)
         that the channels are less, about that of the floor.
     """
-    count, n = s.shape
+    n, count = s.shape
     rows = np.empty((8, n, count), np.float32)
     # What is filled last lends its place before: the less memory, the more of it is at hand.
     edges, place, powers = rows[:2], rows[2], rows[4:8]
     rise, square = powers[:2], powers[2:]
-    np.multiply(cv2.transpose(s), 1.0 / blur, out=place)
+    np.multiply(s, 1.0 / blur, out=place)
     wide = (half_width / blur).astype(np.float32)[:, None]
     np.add(place, wide, out=edges[0])
     np.subtract(place, wide, out=edges[1])
@@ -164,17 +168,18 @@ def profile_products(
         for row, more in zip((rows[0], rows[1], rows[3]), sharp):
             row += more
     # Numbers about zero keep their digits in sums of squares; the first pixel shows floor.
-    less = pixels[0, 0].astype(np.float32)
-    np.subtract(pixels.T, less[:, None, None], out=rows[4:7])
-    rows[7] = 1.0
+    less = channels[:, 0, 0].astype(np.float32)
+    rows = rows[:5 + len(channels)]
+    np.subtract(channels, less[:, None, None], out=rows[4:-1])
+    rows[-1] = 1.0
     # The ones stay out of one factor: a matrix times its own transpose goes a slower way.
-    grouped = rows.reshape(8, -1, members * count)
-    pooled = grouped[:7].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
+    grouped = rows.reshape(len(rows), -1, members * count)
+    pooled = grouped[:-1].transpose(1, 0, 2) @ grouped.transpose(1, 2, 0)
     return pooled.transpose(1, 2, 0).astype(float, order='C'), rows, less
 
 
 def products_by_shift(rows: NDArray[np.float32]) -> Array:
-    """Products of all rows (8, N, P) with D of each station (8, N)."""
+    """Products of all rows (R, N, P) with D of each station (R, N)."""
     by_shift = (rows.transpose(1, 0, 2) @ rows[1, :, :, None])[..., 0]
     return by_shift.T.astype(float, order='C')
 
@@ -191,25 +196,26 @@ def _edgeworth(
     :param bell: exp(-x^2 / 2) of them.
     """
     cumulant = np.square(np.square(across)).sum(axis=1) / (-120.0 * blur**4)
-    share = (cumulant / -24.0).astype(np.float32)[:, None] * bell
     square, added = np.square(edges), np.empty((3, *edges.shape[1:]), np.float32)
     three, six, ten, fifteen = np.array([3.0, 6.0, 10.0, 15.0], np.float32)
     # All in one place, which the processor has at hand: He3, He4 and He5.
     value = square - three
     value *= edges
-    value *= share * np.float32(1.0 / math.sqrt(2.0 * math.pi))
+    value *= bell
     np.subtract(value[0], value[1], out=added[0])
+    added[0] *= np.float32(1.0 / math.sqrt(2.0 * math.pi))
     np.subtract(square, six, out=value)
     value *= square
     value += three
-    value *= share
+    value *= bell
     np.subtract(value[0], value[1], out=added[1])
     np.subtract(square, ten, out=value)
     value *= square
     value += fifteen
     value *= edges
-    value *= share
+    value *= bell
     np.subtract(value[0], value[1], out=added[2])
+    added *= (cumulant / -24.0).astype(np.float32)[:, None]
     return added
 
 

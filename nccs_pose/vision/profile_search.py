@@ -20,6 +20,7 @@ import cv2
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
+from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.profile_products import as_complex
 from nccs_pose.vision.profiles import FOUND, FOUND_FRACTION, ProfileFit
 import numpy as np
@@ -49,7 +50,7 @@ def search_profiles(
     best = pooled.argmax(axis=1)
     rows = np.arange(len(bands))
     # From station to station the tape stays and the noise does not.
-    noise = 1.4826 * float(np.median(np.abs(np.diff(contrast, axis=0)))) / np.sqrt(2.0 * together)
+    noise = 1.4826 * upper_median(np.abs(contrast[1:] - contrast[:-1])) / np.sqrt(2.0 * together)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0),
         pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION))
@@ -70,11 +71,9 @@ def contrast_across(
     kernel_half = int(np.ceil((half + 3.0) / step))
     places = int(np.ceil(reach / step))
     side = places + kernel_half
-    s = np.broadcast_to(
-        np.arange(-side, side + 1.0, dtype=np.float32) * np.float32(step),
-        (len(bands), 2 * side + 1))
     weights = colour.discriminant.astype(np.float32)
-    feature = _sample(image, bands, s) @ weights
+    feature = _sample(
+        image, bands, np.arange(-side, side + 1.0, dtype=np.float32) * np.float32(step)) @ weights
     k = np.arange(-kernel_half, kernel_half + 1.0) * step
     box = _blurred(k, bands, colour)
     box -= box.mean(axis=1, keepdims=True)
@@ -107,13 +106,13 @@ def _blurred(at: Array, bands: Bands, colour: LineColour) -> Array:
 def _sample(
     image: NDArray[np.uint8], bands: Bands, offsets: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Image values (N, K, 3) at offsets (N, K) across each band, averaged along it."""
-    n, k = offsets.shape
+    """Image values (N, K, 3) at offsets (K,) across each band, averaged along it."""
+    n, k = len(bands), len(offsets)
     across = as_complex(bands.across)[:, None]
     t = bands.spacing.astype(np.float32) * _ALONG[:, None]
     on_curve = as_complex(bands.centre) + (
         (0.5 * bands.bend).astype(np.float32) * t * t - 1j * t) * across[:, 0]
-    at = (on_curve[..., None] + offsets * across).astype(np.complex64)
+    at = on_curve[..., None] + offsets * across
     values = cv2.remap(
         image, at.view(np.float32).reshape(len(t), n * k, 2), None, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE)

@@ -119,12 +119,12 @@ def fit_profiles(
     """
     blur = _template_blur(colour, rough)
     pooled, rows, less = profile_products(
-        reading.values, reading.place, bands.half_width, bands.across, blur, bands.members)
+        reading.values.T, reading.place, bands.half_width, bands.across, blur, bands.members)
     system = _eliminated(pooled, bands.members * rows.shape[2])
     if not rough:
         floor = less + system.floor.sum(axis=1) / system.floor.shape[1]
         colour = colour.learn(system.height, system.power, system.left, floor)
-    groups = _grouped(system, reading, bands, colour)
+    groups = _grouped(system, reading, bands, colour.discriminant)
     gain, colour = _gain(groups, system, colour, blur, rough)
     by_station = _by_station(groups, pooled, products_by_shift(rows), colour.discriminant)
     shift, sigma = gain * by_station
@@ -150,14 +150,16 @@ def fit_again(
         weighed by its variance; whether a tape is there at all (G,); and the blur learned.
     """
     blur = _template_blur(colour, rough)
-    place = reading.place - beside.astype(np.float32)
+    place = reading.place - beside.astype(np.float32)[:, None]
+    # What the tapes look like is known: the channels count no more one by one.
     pooled, rows, _ = profile_products(
-        reading.values, place, bands.half_width, bands.across, blur, bands.members)
+        reading.along(colour.discriminant), place, bands.half_width, bands.across, blur,
+        bands.members)
     system = _eliminated(pooled, bands.members * rows.shape[2])
-    groups = _grouped(system, reading, bands, colour)
+    groups = _grouped(system, reading, bands, np.ones(1))
     gain, colour = _gain(groups, system, colour, blur, rough)
     expected = beside - 0.5 * colour.blur**2 * bands.bend
-    shift = gain * groups.shared + expected.reshape(-1, bands.members).mean(axis=1)
+    shift = gain * groups.shared + expected.reshape(-1, bands.members).sum(axis=1) / bands.members
     return shift, groups.found, colour
 
 
@@ -205,10 +207,10 @@ class _System(NamedTuple):
     """The normal equations of G groups after elimination: mean, contrast, floor's slope, shift.
 
     :ivar power: of T (G,).
-    :ivar swept: of T, D, s, B and the channels (columns) what mean and T leave of their products
-        with each other (7 rows), then what they have of 1 and of T (9, 7, G).
+    :ivar swept: of T, D, s, B and the C channels (columns) what mean and T leave of their products
+        with each other (4 + C rows), then what they have of 1 and of T (6 + C, 4 + C, G).
     :ivar slope_power: of s in that (G,), and so of D, ``own_power``.
-    :ivar left: covariance of the channels that no template explains (3, 3, G).
+    :ivar left: covariance of the channels that no template explains (C, C, G).
     """
 
     power: Array
@@ -219,25 +221,28 @@ class _System(NamedTuple):
 
     @property
     def height(self) -> Array:
-        """Contrast of each channel (3, G)."""
-        return self.swept[8, 4:]
+        """Contrast of each channel (C, G)."""
+        return self.swept[-1, 4:]
 
     @property
     def floor(self) -> Array:
-        """What each channel is beside the tape (3, G)."""
-        return self.swept[7, 4:]
+        """What each channel is beside the tape (C, G)."""
+        return self.swept[-2, 4:]
 
 
 def _eliminated(pooled: Array, size: int) -> _System:
     """Eliminate mean and T from the rest, and all four from the channels.
 
-    :param pooled: products of T, D, s, B and the channels with each other and with 1 (7, 8, G).
+    :param pooled: products of T, D, s, B and the C channels with each other and with 1
+        (4 + C, 5 + C, G).
     :param size: samples of each group.
     """
-    total, swept = pooled[:, 7], np.empty((9, 7, pooled.shape[2]))
-    rest, means, both, shares = swept[:7], swept[7], swept[:8], swept[8]
+    columns, _, groups = pooled.shape
+    total, swept = pooled[:, -1], np.empty((columns + 2, columns, groups))
+    rest, means, both, shares = swept[:-2], swept[-2], swept[:-1], swept[-1]
     np.divide(total, size, out=means)
-    np.subtract(pooled[:, :7], means[:, None] * total, out=rest)
+    np.multiply(means[:, None], total, out=rest)
+    np.subtract(pooled[:, :-1], rest, out=rest)
     power = np.maximum(rest[0, 0], 1e-9)
     np.divide(rest[0], power, out=shares)
     both -= both[:, :1] * shares
@@ -279,10 +284,13 @@ class _Groups(NamedTuple):
 
 
 def _grouped(
-    system: _System, reading: Reading, bands: Bands, colour: LineColour,
+    system: _System, reading: Reading, bands: Bands, weights: Array,
 ) -> _Groups:
-    """Shifts of the groups along a colour's discriminant."""
-    weights, count = colour.discriminant, len(reading.place)
+    """Shifts of the groups by the channels' sum.
+
+    :param weights: of the channels in it (C,).
+    """
+    count = reading.place.shape[1]
     half_width, spacing = bands.half_width[::bands.members], bands.spacing[::bands.members]
     # Where the grid is finer than the pixels, across or along, each is counted several times.
     repeats = np.maximum(reading.rows / spacing, 1.0) * np.maximum(
@@ -292,7 +300,7 @@ def _grouped(
     seen = weights @ swept[:, 4:]
     own, slope = seen[1], seen[2]
     squares = (weights[:, None] * weights).ravel()
-    variance = squares.dot(system.left.reshape(9, -1))
+    variance = squares.dot(system.left.reshape(len(squares), -1))
     usual = max(upper_median(variance), 1e-12)
     # What crosses a station is as uncertain as it looks.
     variance = np.maximum(variance / _CHANCE, usual)
@@ -305,7 +313,7 @@ def _grouped(
     shift_power = np.maximum(system.own_power - share * crossed, 1e-9)
     variance *= repeats
     moved = (own - share * slope) / shift_power
-    beside = seen[7:] - swept[7:, 1] * moved
+    beside = seen[-2:] - swept[-2:, 1] * moved
     a, told = beside[1], power / variance
     level, certain = _levels(bands.label[::bands.members], a, power, told, half_width)
     found = certain & (a + 1.0 / np.sqrt(told) > FOUND_FRACTION * level)
@@ -313,12 +321,12 @@ def _grouped(
     known = told * np.square(_CONTRAST_SPREAD * level)
     smooth = np.maximum((a * known + level) / (known + 1.0), 1e-9)
     tilt = believed * slope - share * moved
-    base, tape = beside - swept[7:, 2] * tilt
+    base, tape = beside - swept[-2:, 2] * tilt
     # By what tells of the blur, and the contrasts that the shifts are of.
-    total = swept[3, 3].dot(np.square(np.maximum(seen[8], 0.0)))
+    total = swept[3, 3].dot(np.square(np.maximum(seen[-1], 0.0)))
     off = swept[3, 3].dot(np.square(moved) - variance / shift_power)
     return _Groups(
-        moved / smooth, found, seen[8], seen[3], max(float(off / max(total, 1e-9)), 0.0),
+        moved / smooth, found, seen[-1], seen[3], max(float(off / max(total, 1e-9)), 0.0),
         base, tape, tilt, smooth, variance / shift_power)
 
 
