@@ -67,7 +67,7 @@ def _told(pose: Pose2) -> Told:
 def test_a_pose_is_known_with_its_twins() -> None:
     ledger = _ledger((HALF_TURN,), None, ())
     assert not ledger.knows(HERE)
-    ledger.refuse(AWAY, _alignment(HERE))
+    ledger.refuse(AWAY, _found(HERE, 0.5))
     assert ledger.knows(HERE) and ledger.was_laid(HERE)
     assert ledger.knows(HALF_TURN @ HERE) and not ledger.was_laid(HALF_TURN @ HERE)
     ledger.begin(THERE)
@@ -202,6 +202,16 @@ def test_what_explains_all_on_thin_lines_and_more_than_what_holds_leaves_that_op
             pose=THERE, support=np.ones(lines), whole=np.arange(lines), explained=1.0,
             missing=())))
         assert [c.pose for c in ledger.closed().open] == ([THERE] if opens else [])
+
+
+@pytest.mark.parametrize(('refused', 'left'), [(0.4, 1), (0.6, 1), (0.8, 0)])
+def test_nothing_holds_where_the_image_shows_more_of_a_pose_that_it_speaks_against(
+    refused: float, left: int,
+) -> None:
+    ledger = _ledger((), None, ())
+    ledger.hold(_found(HERE, 0.9, by_strips=0.6), None)
+    ledger.refuse(AWAY, _found(THERE, 0.1, by_strips=refused))
+    assert len(ledger.closed().held) == left
 
 
 @pytest.mark.parametrize(('shown', 'promising'), [

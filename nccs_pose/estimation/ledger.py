@@ -194,19 +194,21 @@ class Ledger:
 
     def refuse(self, against: Objection, shown: Found) -> None:
         """Note a pose that does not hold."""
-        pose = shown.alignment.pose
-        self._laid.append(pose)
-        self._settle_twins(pose)
-        self._refused.append(Refused(against, shown.alignment))
+        self._note(against, shown.alignment)
         self._most_refused = max(self._most_refused, shown.shown)
 
     def hide(self, against: Objection, shown: Found) -> None:
         """Note a pose that would hold, if something hid the lines that it misses."""
         pose = shown.alignment.pose
-        self.refuse(against, shown)
+        self._note(against, shown.alignment)
         alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
         self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
         self._excused.append(shown)
+
+    def _note(self, against: Objection, alignment: Alignment) -> None:
+        self._laid.append(alignment.pose)
+        self._settle_twins(alignment.pose)
+        self._refused.append(Refused(against, alignment))
 
     def closed(self) -> Sifted:
         """What is left when no more poses are laid on the image."""
