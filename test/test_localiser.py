@@ -29,6 +29,7 @@ from nccs_pose.estimation.aligner import Aligner, SPACING
 from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.judge import Judge
+from nccs_pose.estimation.line_history import LineHistory
 import nccs_pose.estimation.localiser as localiser_module
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
@@ -564,7 +565,7 @@ def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatc
     # Nor would any line that should be seen there.
     judge = Judge(
         Searcher(table, RAILS, options), aligner.predictor, table, RAILS, options)
-    against = judge.found(image, alignment, (), frozenset(), expected=False)
+    against = judge.found(image, alignment, (), LineHistory(), expected=False, strips=None)
     assert isinstance(against, Objection) and not judge.may_miss(alignment, against)
     seen = replace(alignment, support=np.array([1.0, 1.0, 0.0, np.nan]))
     assert judge.may_miss(seen, against)
