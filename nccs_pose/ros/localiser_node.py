@@ -156,7 +156,9 @@ class LocaliserNode(LifecycleNode):
         self._options, estimator = self._settings.options()
         for name in ('rig_file', 'map_file'):
             if not getattr(self._options, name):
-                raise OptionError(f'parameter {name} is not set')
+                raise OptionError(
+                    f'parameter {name} is not set; a parameter file has to name this node, '
+                    f'{self.get_fully_qualified_name()}, or /**')
         self._rig = rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
         if line_map.frame != self._options.map_frame:

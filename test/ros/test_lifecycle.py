@@ -165,6 +165,15 @@ def test_bad_configuration_fails_with_the_reason_and_the_node_lives(world):
         assert node.stop(signal.SIGTERM) == 0, node.output
 
 
+def test_a_parameter_file_that_names_another_node_is_suspected(world):
+    # The shipped files name the localiser, in any namespace.
+    node = world.localiser('--params-file', 'config/room.yaml', '-r', '__node:=eye')
+    status = world.user.wait(lambda: world.user.statuses.get('eye: pose'))
+    assert status, node.output
+    assert status.message.endswith(
+        'rig_file is not set; a parameter file has to name this node, /eye, or /**')
+
+
 def test_transforms_without_tf2_ros_fail_with_the_reason(world):
     try:
         import tf2_ros  # noqa: F401
