@@ -490,12 +490,14 @@ def test_no_character_ends_finished_work(drive: Path, tmp_path: Path) -> None:
             made.unlink(missing_ok=True)
 
 
-def test_a_missing_package_is_named() -> None:
-    code = ('import sys; sys.modules["rosbags"] = None; from nccs_pose.cli import main; '
+@pytest.mark.parametrize(('package', 'words'), [
+    ('rosbags', 'pip install "rosbags'), ('cv2', "pip install 'nccs_pose[pip]' brings it")])
+def test_a_missing_package_is_named(package: str, words: str) -> None:
+    code = (f'import sys; sys.modules[{package!r}] = None; from nccs_pose.cli import main; '
             'sys.exit(main(["replay", "--help"]))')
     run = subprocess.run([sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True)
     assert run.returncode == 2
-    assert 'pip install "rosbags' in run.stderr
+    assert words in run.stderr
     assert 'Traceback' not in run.stderr
 
 
