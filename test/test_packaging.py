@@ -78,6 +78,15 @@ def test_setup_installs_what_ament_needs(repository: Path, monkeypatch: pytest.M
     assert not any(re.search('ros|opencv|rclpy', r) for r in arguments['install_requires'])
 
 
+def test_a_source_archive_has_no_tests(repository: Path, tmp_path: Path):
+    # By default those named test*.py are in it, without what they import.
+    subprocess.run([sys.executable, 'setup.py', '-q', 'egg_info', '--egg-base', str(tmp_path)],
+                   cwd=repository, check=True, capture_output=True)
+    names = (tmp_path / 'nccs_pose.egg-info/SOURCES.txt').read_text().splitlines()
+    assert 'bags/room/metadata.yaml' in names
+    assert not [name for name in names if name.startswith('test/')]
+
+
 def test_scripts_go_where_ros2_run_looks(repository: Path):
     text = (repository / 'setup.cfg').read_text()
     assert 'script_dir=$base/lib/nccs_pose' in text
