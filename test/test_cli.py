@@ -29,7 +29,7 @@ import cv2
 from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.paper_localiser import PaperLocaliser
-from nccs_pose.cli.parser import COMMANDS
+from nccs_pose.cli.parser import COMMANDS, parse
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError, FrameRefusedError, OptionError
 from nccs_pose.estimation.localiser import Localiser
@@ -271,6 +271,22 @@ def test_wrong_input_ends_in_one_sentence(
     message = refusal(capsys, change(arguments))
     for word in words:
         assert word in message
+
+
+def test_the_package_s_own_files_are_found_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ['replay', 'bags/room', '--rig', 'config/room_rig.yaml', '--map',
+             'config/room_map.yaml', '--params', 'config/room.yaml', '--output', 'config/p.tum']
+    given = parse(words).arguments
+    assert (given.bag / 'metadata.yaml').exists()
+    assert load_rig(given.rig) and load_map(given.map) and make_options(given.params, [])
+    assert given.output == Path('config/p.tum')
+    # One's own of that name comes first.
+    Path('config').mkdir()
+    Path('config/room_map.yaml').touch()
+    assert parse(words).arguments.map == Path('config/room_map.yaml')
 
 
 @pytest.mark.parametrize(('name', 'calibration_sigma'), [

@@ -28,12 +28,12 @@ from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.resources import resolve, share_directory
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import reference
 from nccs_pose.ros.camera_options import CameraOptions
 from nccs_pose.ros.interface import INPUTS, OUTPUTS, STAND_IN_OUTPUTS
-from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np
 import pytest

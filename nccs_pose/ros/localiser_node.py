@@ -31,6 +31,7 @@ from nccs_pose.errors import NccsPoseError, OptionError
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.node_options import NodeOptions
@@ -44,7 +45,6 @@ from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.pose_keeper import PoseKeeper
 from nccs_pose.ros.qos import overridable, profile
-from nccs_pose.ros.resources import resolve
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
