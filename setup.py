@@ -45,12 +45,12 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            'demo = nccs_pose.ros.demo:main',
-            'localiser = nccs_pose.ros.localiser:main',
+            'demo = nccs_pose.ros.programs:demo',
+            'localiser = nccs_pose.ros.programs:localiser',
             'nccs-pose = nccs_pose.cli:main',
-            'play = nccs_pose.ros.player:main',
-            'stand_in_camera = nccs_pose.ros.stand_in_camera:main',
-            'stream_benchmark = nccs_pose.ros.stream_benchmark:main',
+            'play = nccs_pose.ros.programs:play',
+            'stand_in_camera = nccs_pose.ros.programs:stand_in_camera',
+            'stream_benchmark = nccs_pose.ros.programs:stream_benchmark',
         ],
     },
 )

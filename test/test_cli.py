@@ -29,7 +29,7 @@ import cv2
 from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.paper_localiser import PaperLocaliser
-from nccs_pose.cli.parser import COMMANDS
+from nccs_pose.cli.parser import COMMANDS, parse
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError, FrameRefusedError, OptionError
 from nccs_pose.estimation.localiser import Localiser
@@ -273,6 +273,22 @@ def test_wrong_input_ends_in_one_sentence(
         assert word in message
 
 
+def test_the_package_s_own_files_are_found_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ['replay', 'bags/room', '--rig', 'config/room_rig.yaml', '--map',
+             'config/room_map.yaml', '--params', 'config/room.yaml', '--output', 'config/p.tum']
+    given = parse(words).arguments
+    assert (given.bag / 'metadata.yaml').exists()
+    assert load_rig(given.rig) and load_map(given.map) and make_options(given.params, [])
+    assert given.output == Path('config/p.tum')
+    # One's own of that name comes first.
+    Path('config').mkdir()
+    Path('config/room_map.yaml').touch()
+    assert parse(words).arguments.map == Path('config/room_map.yaml')
+
+
 @pytest.mark.parametrize(('name', 'calibration_sigma'), [
     ('arena.yaml', 0.0),  # a simulation knows its camera exactly
     ('robot.yaml', 0.1), ('room.yaml', 0.1)])
@@ -490,12 +506,14 @@ def test_no_character_ends_finished_work(drive: Path, tmp_path: Path) -> None:
             made.unlink(missing_ok=True)
 
 
-def test_a_missing_package_is_named() -> None:
-    code = ('import sys; sys.modules["rosbags"] = None; from nccs_pose.cli import main; '
+@pytest.mark.parametrize(('package', 'words'), [
+    ('rosbags', 'pip install "rosbags'), ('cv2', "pip install 'nccs_pose[pip]' brings it")])
+def test_a_missing_package_is_named(package: str, words: str) -> None:
+    code = (f'import sys; sys.modules[{package!r}] = None; from nccs_pose.cli import main; '
             'sys.exit(main(["replay", "--help"]))')
     run = subprocess.run([sys.executable, '-c', code], cwd=REPO, capture_output=True, text=True)
     assert run.returncode == 2
-    assert 'pip install "rosbags' in run.stderr
+    assert words in run.stderr
     assert 'Traceback' not in run.stderr
 
 

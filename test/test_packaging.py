@@ -28,12 +28,12 @@ from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.resources import resolve, share_directory
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import reference
 from nccs_pose.ros.camera_options import CameraOptions
 from nccs_pose.ros.interface import INPUTS, OUTPUTS, STAND_IN_OUTPUTS
-from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np
 import pytest
@@ -76,6 +76,15 @@ def test_setup_installs_what_ament_needs(repository: Path, monkeypatch: pytest.M
     assert 'nccs_pose.ros' in arguments['packages']
     # An unmet requirement would break pkg_resources' entry points under apt's Python packages.
     assert not any(re.search('ros|opencv|rclpy', r) for r in arguments['install_requires'])
+
+
+def test_a_source_archive_has_no_tests(repository: Path, tmp_path: Path):
+    # By default those named test*.py are in it, without what they import.
+    subprocess.run([sys.executable, 'setup.py', '-q', 'egg_info', '--egg-base', str(tmp_path)],
+                   cwd=repository, check=True, capture_output=True)
+    names = (tmp_path / 'nccs_pose.egg-info/SOURCES.txt').read_text().splitlines()
+    assert 'bags/room/metadata.yaml' in names
+    assert not [name for name in names if name.startswith('test/')]
 
 
 def test_scripts_go_where_ros2_run_looks(repository: Path):

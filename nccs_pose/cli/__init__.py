@@ -26,6 +26,7 @@ import sys
 
 from nccs_pose.cli.parser import find_command, parse
 from nccs_pose.errors import NccsPoseError
+from nccs_pose.missing_package import missing_package
 
 __all__ = ['main']
 
@@ -66,9 +67,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{name}: this machine has too little memory for it.', file=sys.stderr)
         return 2
     except ModuleNotFoundError as error:
-        if (error.name or '').startswith('nccs_pose'):
-            raise
-        print(
-            f'{name}: needs the Python package {error.name}, which is not installed '
-            '(see requirements.txt).', file=sys.stderr)
+        print(f'{name}: {missing_package(error)}', file=sys.stderr)
         return 2

@@ -30,6 +30,7 @@ from nccs_pose.calibration.rim import rig_from_outline
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.cli.option_settings import explain, parse_settings
 from nccs_pose.files.pictures import save_figure
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
 from nccs_pose.geometry.rig import Rig
@@ -44,10 +45,10 @@ _OUTLINE_IMAGES = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('bag', type=Path, help='rosbag2 of a drive, or a folder of images')
-    parser.add_argument('--rig', type=Path, required=True, metavar='ROUGH.yaml',
+    parser.add_argument('bag', type=resolve, help='rosbag2 of a drive, or a folder of images')
+    parser.add_argument('--rig', type=resolve, required=True, metavar='ROUGH.yaml',
                         help='the rig as far as it is known')
-    parser.add_argument('--map', type=Path, required=True, help='map of the lines (YAML)')
+    parser.add_argument('--map', type=resolve, required=True, help='map of the lines (YAML)')
     parser.add_argument(
         '--output', type=Path, required=True, metavar='RIG.yaml',
         help='refined rig to write; beside it goes RIG.report.md with its pictures')

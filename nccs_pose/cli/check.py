@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from nccs_pose.argument_types import number, whole
 from nccs_pose.calibration.from_images import measure
@@ -26,6 +25,7 @@ from nccs_pose.calibration.monitor import CalibrationMonitor, Condition, Monitor
 from nccs_pose.calibration.parameters import RigModel
 from nccs_pose.cli.drive_images import DriveImages
 from nccs_pose.errors import CalibrationError
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.lines import LineMap
 import numpy as np
@@ -34,9 +34,9 @@ _FEWEST = 10  # frames; fewer say nothing of a rig
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('bag', type=Path, help='rosbag2 of a drive, or a folder of images')
-    parser.add_argument('--rig', type=Path, required=True, help='the rig to check (YAML)')
-    parser.add_argument('--map', type=Path, required=True, help='map of the lines (YAML)')
+    parser.add_argument('bag', type=resolve, help='rosbag2 of a drive, or a folder of images')
+    parser.add_argument('--rig', type=resolve, required=True, help='the rig to check (YAML)')
+    parser.add_argument('--map', type=resolve, required=True, help='map of the lines (YAML)')
     parser.add_argument(
         '--pose-error', type=number(0.01, 1000.0, 'mm'), default=5.0, metavar='MM',
         help='pose error that matters, mm (default %(default)s)')

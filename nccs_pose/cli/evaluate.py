@@ -26,6 +26,7 @@ from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.tables import as_numbers, summary_table
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.pictures import as_title, save_figure
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.trajectories import format_stamp, read_tum
 from nccs_pose.files.yaml_files import load_map
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='write the numbers: .json (metres, radians) or .md (the table)')
     parser.add_argument('--plots', type=Path, metavar='DIR', help='folder for pictures')
     parser.add_argument(
-        '--map', type=Path, help='map of the lines (YAML), to draw the trajectory among them')
+        '--map', type=resolve, help='map of the lines (YAML), to draw the trajectory among them')
 
 
 def run(args: argparse.Namespace) -> int:

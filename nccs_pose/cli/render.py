@@ -23,6 +23,7 @@ from nccs_pose.argument_types import image_width, number, whole
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import FileError
 from nccs_pose.files.bags import BagWriter
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.text_files import check_writable
 from nccs_pose.files.yaml_files import load_map, load_rig, save_map, save_rig
 from nccs_pose.geometry.pose import RigidTransform
@@ -47,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--width', type=image_width(64), default=1280, metavar='PX',
         help='width of the images, 4:3 (default %(default)s)')
-    parser.add_argument('--rig', type=Path, help="another rig than the scene's (YAML)")
-    parser.add_argument('--map', type=Path, help="another map than the scene's (YAML)")
+    parser.add_argument('--rig', type=resolve, help="another rig than the scene's (YAML)")
+    parser.add_argument('--map', type=resolve, help="another map than the scene's (YAML)")
     parser.add_argument(
         '--frames', type=whole(1, 10**6), default=50, help='images (default %(default)s)')
     parser.add_argument(

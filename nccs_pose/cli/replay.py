@@ -50,6 +50,7 @@ from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bag_events import BagEvent, StampedOdometry
 from nccs_pose.files.bags import BagReader, BagTopics
 from nccs_pose.files.pictures import as_title, save_figure, save_image
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.text_files import check_writable, read_text, write_text
 from nccs_pose.files.trajectories import write_tum
 from nccs_pose.files.yaml_files import load_map, load_rig
@@ -66,9 +67,10 @@ _ENDINGS = ('frames.jsonl', 'run.json', 'evaluation.json')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('bag', type=Path, help='rosbag2 folder (or a single .mcap or .db3 file)')
-    parser.add_argument('--rig', type=Path, required=True, help='calibration of the rig (YAML)')
-    parser.add_argument('--map', type=Path, required=True, help='map of the lines (YAML)')
+    parser.add_argument(
+        'bag', type=resolve, help='rosbag2 folder (or a single .mcap or .db3 file)')
+    parser.add_argument('--rig', type=resolve, required=True, help='calibration of the rig (YAML)')
+    parser.add_argument('--map', type=resolve, required=True, help='map of the lines (YAML)')
     parser.add_argument(
         '--output', type=Path, required=True, metavar='POSES.tum',
         help='trajectory to write; beside it go POSES.frames.jsonl (every frame: state, reason, '
@@ -83,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="nccs: this project's localiser (default); paper: the published chain, started and "
              'its blobs told apart by the project')
     parser.add_argument(
-        '--params', type=Path, metavar='FILE',
+        '--params', type=resolve, metavar='FILE',
         help='ROS parameter file of the node, for the options of its localiser')
     parser.add_argument(
         '--option', action='append', default=[], metavar='NAME=VALUE',

@@ -23,6 +23,7 @@ from nccs_pose.cli.localiser_options import make_options
 from nccs_pose.cli.progress import Progress
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.starts import Place, PLACES, run_starts, starts_table
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.text_files import check_writable, write_text
 from nccs_pose.files.yaml_files import load_map
 
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'names', nargs='*', metavar='PLACE',
         help='only those whose names contain one of these words; all if none is given')
     parser.add_argument('--list', action='store_true', help='name the places and stop')
-    parser.add_argument('--map', type=Path, metavar='FILE', help='this map instead')
+    parser.add_argument('--map', type=resolve, metavar='FILE', help='this map instead')
     parser.add_argument(
         '--option', action='append', default=[], metavar='NAME=VALUE',
         help='of the localiser, for --map (reach=9.0)')

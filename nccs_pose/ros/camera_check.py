@@ -52,11 +52,16 @@ def contradiction(info: CameraInfo, camera: PinholeCamera, tolerance: float) -> 
 
 
 def _distortion(info: CameraInfo, camera: PinholeCamera, tolerance: float) -> str:
-    """Whether both distort alike, by where they put the pixels of the image."""
+    """Whether both distort alike, by where they put the pixels of the image.
+
+    Zeros at the end say nothing, and nothing but zeros no distortion, whatever the model: drivers
+    fill in as many as they like, and under names of their own.
+    """
+    theirs = tuple(np.trim_zeros(info.d, 'b'))
+    model = info.distortion_model if theirs else ''
     try:
         other = replace(
-            camera, distortion_model=info.distortion_model or camera.distortion_model,
-            distortion=tuple(info.d))
+            camera, distortion_model=model or camera.distortion_model, distortion=theirs)
     except GeometryError as error:
         return f'camera_info is none of a camera that the rig could have: {error}'
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
@@ -66,10 +71,12 @@ def _distortion(info: CameraInfo, camera: PinholeCamera, tolerance: float) -> st
     apart = np.abs(other.project(directions)[0] - pixels).max(initial=0.0)
     if not apart <= tolerance * camera.fx + 1e-6:  # there and back is rounded
         return (f'camera_info says distortion {_coefficients(other)}, the rig '
-                f'{_coefficients(camera)}: up to {apart:.1f} px apart')
+                f'{_coefficients(camera)}: up to {apart:.3g} px apart')
     return ''
 
 
 def _coefficients(camera: PinholeCamera) -> str:
+    if not any(camera.distortion):
+        return 'none'
     numbers = ', '.join(f'{k:g}' for k in camera.distortion)
     return f'{camera.distortion_model} [{numbers}]'

@@ -40,6 +40,7 @@ from nccs_pose.evaluation.tables import summary_table, table
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader
 from nccs_pose.files.pictures import save_figure, save_image
+from nccs_pose.files.resources import resolve, share_directory
 from nccs_pose.files.serialised_bag import SerialisedBag
 from nccs_pose.files.text_files import check_writable
 from nccs_pose.files.yaml_files import load_map
@@ -47,7 +48,6 @@ from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.ros.conversions import decode, PLANAR, pose_to_planar, stamp_to_ns
 from nccs_pose.ros.player import Playback, Player, wait_for_subscribers
-from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import stay_alone, use_large_images
 import numpy as np

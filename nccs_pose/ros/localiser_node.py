@@ -31,6 +31,7 @@ from nccs_pose.errors import NccsPoseError, OptionError
 from nccs_pose.estimation.estimate import Estimate
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.node_options import NodeOptions
@@ -44,7 +45,6 @@ from nccs_pose.ros.outputs import Outputs
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.pose_keeper import PoseKeeper
 from nccs_pose.ros.qos import overridable, profile
-from nccs_pose.ros.resources import resolve
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
@@ -71,6 +71,7 @@ class LocaliserNode(LifecycleNode):
         self._inputs: Inputs | None = None
         self._watch: CalibrationWatch | None = None
         self._estimate: Estimate | None = None
+        self._image_stamp_ns: int | None = None
         self._pose_stamp_ns: int | None = None
         self._latency_s = 0.0
         self._paused = False
@@ -155,7 +156,9 @@ class LocaliserNode(LifecycleNode):
         self._options, estimator = self._settings.options()
         for name in ('rig_file', 'map_file'):
             if not getattr(self._options, name):
-                raise OptionError(f'parameter {name} is not set')
+                raise OptionError(
+                    f'parameter {name} is not set; a parameter file has to name this node, '
+                    f'{self.get_fully_qualified_name()}, or /**')
         self._rig = rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
         if line_map.frame != self._options.map_frame:
@@ -168,10 +171,11 @@ class LocaliserNode(LifecycleNode):
         self._watch = CalibrationWatch(rig, line_map)
 
     def _activate(self) -> None:
-        assert self._localiser is not None and self._keeper is not None and self._rig is not None
+        assert self._localiser is not None and self._outputs is not None
+        assert self._keeper is not None and self._rig is not None
         self._localiser.reset()
-        self._estimate = None
-        self._pose_stamp_ns = None
+        self._outputs.transforms.forget()
+        self._estimate = self._image_stamp_ns = self._pose_stamp_ns = None
         self._keeper.offer(self._localiser)
         self._inputs = Inputs(
             self, lambda: self._options, self._rig.camera, self._localiser, self._keeper,
@@ -198,7 +202,7 @@ class LocaliserNode(LifecycleNode):
         if self._outputs is not None:
             self._outputs.close()
         self._outputs = self._localiser = self._keeper = self._watch = self._rig = None
-        self._estimate = self._pose_stamp_ns = None
+        self._estimate = self._image_stamp_ns = self._pose_stamp_ns = None
 
     def _shut_down(self) -> None:
         try:
@@ -216,12 +220,14 @@ class LocaliserNode(LifecycleNode):
             return
         self._inputs.use_waiting_odometry()
         estimate = self._localiser.process(stamp_ns, image)
-        if self._estimate is not None and stamp_ns < self._estimate.stamp_ns:
-            back = 1e-9 * (self._estimate.stamp_ns - stamp_ns)
+        if self._image_stamp_ns is not None and stamp_ns < self._image_stamp_ns:
+            back = 1e-9 * (self._image_stamp_ns - stamp_ns)
             self._tally.resets += 1
+            self._outputs.transforms.forget()
+            self._pose_stamp_ns = None
             self.get_logger().warning(
                 f'the stamps jumped back by {back:.3f} s: the tracker starts anew')
-        self._estimate = estimate
+        self._estimate, self._image_stamp_ns = estimate, stamp_ns
         if not self._withheld() and self._outputs.publish(estimate):
             self._tally.answered += 1
             self._pose_stamp_ns = stamp_ns

@@ -25,6 +25,7 @@ import time
 
 from nccs_pose.argument_types import number, seconds
 from nccs_pose.errors import FileError, NccsPoseError
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.serialised_bag import BagTopic, SerialisedBag
 from nccs_pose.ros.conversions import ns_to_stamp
 from nccs_pose.ros.start import initialise, leave, StartError, told_to_end
@@ -227,7 +228,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='play', description='Publish the topics of a rosbag2 with their recorded timing. '
         'Topics are remapped as of any node: --ros-args -r /camera/image_raw:=/image.')
-    parser.add_argument('bag', help='folder of the bag')
+    parser.add_argument('bag', type=resolve, help='folder of the bag')
     parser.add_argument('--rate', type=number(0.001, 1000.0), default=1.0,
                         help='speed factor (default 1)')
     parser.add_argument('--loop', action='store_true', help='begin again at the end')

@@ -22,11 +22,11 @@ from typing import Any
 from nccs_pose.errors import FileError
 from nccs_pose.estimation.estimate import Estimate, State
 from nccs_pose.estimation.localiser import Localiser
+from nccs_pose.files.resources import expanded
 from nccs_pose.files.saved_pose import map_hash, read_saved_pose, SavedPose, write_saved_pose
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.node_options import NodeOptions
-from nccs_pose.ros.resources import expanded
 import numpy as np
 
 

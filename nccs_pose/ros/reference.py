@@ -29,6 +29,7 @@ from typing import Any
 
 from nccs_pose.estimation.estimate import State
 from nccs_pose.estimation.options import LocaliserOptions
+from nccs_pose.files.resources import share_directory
 from nccs_pose.files.text_files import write_text
 from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.camera_options import CameraOptions
@@ -42,7 +43,6 @@ from nccs_pose.ros.interface import (
     TF_MODES,
 )
 from nccs_pose.ros.launch_arguments import launch_arguments
-from nccs_pose.ros.resources import share_directory
 from nccs_pose.ros.statuses import NODE_STATES, STATUSES
 
 HEAD = """\

@@ -27,6 +27,7 @@ import cv2
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from nccs_pose.errors import NccsPoseError, OptionError
+from nccs_pose.files.resources import resolve
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.camera_options import CameraOptions, SCENES
 from nccs_pose.ros.command_line import read_command_line
@@ -48,7 +49,6 @@ from nccs_pose.ros.interface import (
 from nccs_pose.ros.lifecycle import in_words
 from nccs_pose.ros.parameters import NodeParameters
 from nccs_pose.ros.qos import overridable, profile
-from nccs_pose.ros.resources import resolve
 from nccs_pose.ros.start import initialise, leave, told_to_end
 from nccs_pose.ros.transport import use_large_images
 from nccs_pose.simulation.drive import (

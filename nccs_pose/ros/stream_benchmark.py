@@ -38,9 +38,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nccs_pose.argument_types import number
 from nccs_pose.errors import NccsPoseError
 from nccs_pose.evaluation.tables import table
+from nccs_pose.files.resources import resolve, share_directory
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.ros.conversions import compressed_message, image_message, stamp_to_ns
-from nccs_pose.ros.resources import resolve, share_directory
 from nccs_pose.ros.start import initialise, StartError, told_to_end
 from nccs_pose.ros.transport import stay_alone, use_large_images
 from nccs_pose.simulation.drive import make_drive, render_frame

@@ -86,10 +86,23 @@ class TransformOutput:
             if stamp_ns < 0:
                 self._refuse('tf_missing', f'no transform is of a time before zero: {stamp_ns} ns')
                 return
-            if self._pending and stamp_ns < self._pending[-1][0]:
-                self._pending.clear()  # the clock was set back
             self._pending.append((stamp_ns, pose))
             self.retry(stamp_ns)
+
+    def forget(self) -> None:
+        """Forget what waits and what /tf said: the stamps begin anew.
+
+        tf2 sorts transforms by their stamps and keeps those of the last ten seconds. What comes
+        after a step back would lie among transforms of other places, or be refused for good.
+        """
+        self._pending.clear()
+        if self._buffer is not None:
+            # What has arrived and was not taken yet may be of the old time as well.
+            for _ in waiting(self._listener.tf_sub, MOST_WAITING):
+                pass
+            # It leaves /tf_static alone, which would not be sent again: a StaticCache of tf2 does
+            # nothing when it is told to clear its list.
+            self._buffer.clear()
 
     def retry(self, now_ns: int) -> None:
         """Try again what waits, oldest first; give up what is older than the patience."""

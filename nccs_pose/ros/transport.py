@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 
-from nccs_pose.ros.resources import share_directory
+from nccs_pose.files.resources import share_directory
 
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 import os
 import subprocess
@@ -209,13 +210,35 @@ def test_camera_info_of_the_rig_agrees():
     assert contradiction(CameraInfo(width=1280, height=960), camera, 0.0) == ''  # uncalibrated
 
 
+@pytest.mark.parametrize(('model', 'number'), [
+    ('plumb_bob', 0), ('plumb_bob', 8), ('rational_polynomial', 14), ('equidistant', 4),
+    ('Plumb Bob', 5), ('', 5)])
+def test_zeros_are_no_distortion_whatever_the_model(model: str, number: int):
+    camera = arena_rig().camera
+    info = c.camera_info_message(5, 'camera', camera)
+    info.distortion_model, info.d = model, [0.0] * number
+    assert contradiction(info, camera, 0.0) == ''
+    distorting = replace(camera, distortion=(-0.3, 0.1))
+    text = contradiction(info, distorting, 0.02)
+    assert 'says distortion none, the rig plumb_bob [-0.3, 0.1]: up to ' in text
+
+
+@pytest.mark.parametrize(('model', 'number'), [('plumb_bob', 8), ('rational_polynomial', 14)])
+def test_zeros_after_the_last_coefficient_do_not_matter(model: str, number: int):
+    camera = replace(arena_rig().camera, distortion=(-0.3, 0.1))
+    info = c.camera_info_message(5, 'camera', camera)
+    info.distortion_model, info.d = model, [-0.3, 0.1] + [0.0] * (number - 2)
+    assert contradiction(info, camera, 0.0) == ''
+
+
 @pytest.mark.parametrize(('changes', 'words'), [
     ({'width': 640}, ('640 x 960', '1280 x 960')),
     ({'k': [900.0, 0.0, 641.0, 0.0, 750.0, 477.5, 0.0, 0.0, 1.0]}, ('fx = 900', '750')),
     ({'k': [750.0, 0.0, 641.0, 0.0, 750.0, 400.0, 0.0, 0.0, 1.0]}, ('cy = 400', '477.5')),
     ({'k': [math.nan] * 9}, ('nan', '750')),
     ({'binning_x': 2, 'binning_y': 2}, ('2 x 2',)),
-    ({'d': [-0.3, 0.1, 0.0, 0.0, 0.0]}, ('plumb_bob [-0.3, 0.1', 'plumb_bob []', 'px apart')),
+    ({'d': [-0.3, 0.1, 0.0, 0.0, 0.0]}, ('plumb_bob [-0.3, 0.1]', 'the rig none', 'px apart')),
+    ({'d': [1e300] * 5}, ('plumb_bob [1e+300, ', 'e+303 px apart')),
     ({'d': [math.nan] * 5}, ('nan',)),
     ({'d': [0.1] * 4, 'distortion_model': 'equidistant'}, ('equidistant',)),
 ])

@@ -31,6 +31,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nccs_pose.ros.command_line import without_ros
 from nccs_pose.ros.conversions import image_message
+import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
@@ -92,6 +93,29 @@ def test_what_is_forgotten_has_no_age(pair, arena):
     pair.wait(lambda: age(reports) == 'nan')
 
 
+@pytest.mark.parametrize('relocalised', [False, True])
+def test_where_the_stamps_begin_anew_what_was_before_is_forgotten(
+        pair, arena, monkeypatch, relocalised):
+    forgotten: list[int] = []
+    monkeypatch.setattr(
+        pair.node._outputs.transforms, 'forget', lambda: forgotten.append(
+            pair.node._tally.answered))
+    pair.node.trigger_deactivate()
+    pair.node.trigger_activate()
+    assert forgotten == [0]
+    image = arena[0].image
+    pair.node._on_frame(30_000_000_000, 'camera', image)
+    assert pair.node._pose_stamp_ns == 30_000_000_000
+    if relocalised:
+        pair.node._on_relocalise(Trigger.Request(), Trigger.Response())
+    pair.node._on_frame(5_000_000_000, 'camera', np.zeros_like(image))
+    assert pair.node._pose_stamp_ns is None
+    pair.node._on_frame(5_100_000_000, 'camera', image)
+    # Before what the new time says is broadcast.
+    assert forgotten == [0, 1]
+    assert pair.node._tally.resets == 1
+
+
 @pytest.mark.parametrize('pair', [{'diagnostics_period': 0.05}], indirect=True)
 def test_a_shutdown_that_fails_says_so_and_forgets_everything_all_the_same(
         pair, monkeypatch, capfd):
@@ -139,6 +163,15 @@ def test_bad_configuration_fails_with_the_reason_and_the_node_lives(world):
         relocalise = user.call(Trigger, f'/{name}/relocalise', Trigger.Request())
         assert not relocalise.success
         assert node.stop(signal.SIGTERM) == 0, node.output
+
+
+def test_a_parameter_file_that_names_another_node_is_suspected(world):
+    # The shipped files name the localiser, in any namespace.
+    node = world.localiser('--params-file', 'config/room.yaml', '-r', '__node:=eye')
+    status = world.user.wait(lambda: world.user.statuses.get('eye: pose'))
+    assert status, node.output
+    assert status.message.endswith(
+        'rig_file is not set; a parameter file has to name this node, /eye, or /**')
 
 
 def test_transforms_without_tf2_ros_fail_with_the_reason(world):
