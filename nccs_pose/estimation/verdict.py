@@ -39,11 +39,9 @@ _ON = 0.06
 _EVIDENT = 7.0
 DISTURBED = 0.28
 # Residuals of so many times the image's noise, and of more px than the second number, say that the
-# lines are other ones than thought, or not seen by this rig: of two lines, of three, and of more
-# where no prediction agrees.
+# lines are other ones than thought, or not seen by this rig: of two lines, of three, and of more.
+# More than three are believed where a prediction agrees, unless they lie better elsewhere.
 _UNLIKE_NOISE = ((5.0, 0.0), (3.0, 0.3), (3.0, 0.4))
-# The same of a pose that is believed, where another place may explain them.
-_SUSPECT = (2.0, 0.3)
 
 
 @dataclass(frozen=True)
@@ -98,12 +96,11 @@ def objection(
                 f'{_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not fit '
                 'the image', line=k)
     used = lines_used(alignment)
-    scale, size = alignment.scale, alignment.residual_px
-    times, least = _UNLIKE_NOISE[min(max(used, 2), 4) - 2]
-    if scale > times and size > least and (used < 4 or not expected):
+    if is_suspect(alignment) and (used < 4 or not expected):
+        size = alignment.residual_px
         return Objection(
             f'the {used} lines that it rests on lie {size:.1f} px off, where the noise of the '
-            f'image makes {size / scale:.2f} px')
+            f'image makes {size / alignment.scale:.2f} px')
     if misses_lines(alignment) and not expected:
         return Objection(
             f'it rests on {used} lines and {len(alignment.missing)} more should be in view',
@@ -124,8 +121,8 @@ def is_weak(alignment: Alignment) -> bool:
 
 
 def is_suspect(alignment: Alignment) -> bool:
-    """Whether an expected pose fits so badly that the map may look nearly the same elsewhere."""
-    times, least = _SUSPECT
+    """Whether a pose fits so badly that its lines may be other ones."""
+    times, least = _UNLIKE_NOISE[min(max(lines_used(alignment), 2), 4) - 2]
     return alignment.scale > times and alignment.residual_px > least
 
 
