@@ -28,6 +28,7 @@ import sys
 import cv2
 from nccs_pose.cli import main
 from nccs_pose.cli.localiser_options import make_options
+from nccs_pose.cli.offline_run import repeatable_json
 from nccs_pose.cli.paper_localiser import PaperLocaliser
 from nccs_pose.cli.parser import COMMANDS, parse
 from nccs_pose.cli.progress import Progress
@@ -130,6 +131,15 @@ def test_replaying_twice_gives_the_same_bytes(drive: Path, tmp_path: Path) -> No
         contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert len(contents[0]) >= 8
     assert contents[0] == contents[1]
+
+
+def test_what_is_written_is_the_same_where_only_the_last_bits_differ() -> None:
+    value = np.float64(2.3456789e-7)
+    text = repeatable_json({'covariance': [[value, 0.0]], 'index': 123456789012})
+    assert text == repeatable_json(
+        {'covariance': [[value * (1.0 + 8e-16), 0.0]], 'index': 123456789012})
+    assert json.loads(text) == {
+        'covariance': [[pytest.approx(value, rel=1e-9), 0.0]], 'index': 123456789012}
 
 
 def test_the_paper_s_chain_runs_over_the_same_bag_and_is_worse(

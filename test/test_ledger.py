@@ -64,6 +64,12 @@ def _told(pose: Pose2) -> Told:
     return Told(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
 
 
+def _are(poses: Sequence[Pose2], expected: Sequence[Pose2]) -> bool:
+    """Whether they are the expected ones in this order; a pose that was moved is rounded."""
+    return len(poses) == len(expected) and all(
+        np.allclose(pose.minus(other), 0.0, atol=1e-12) for pose, other in zip(poses, expected))
+
+
 def test_a_pose_is_known_with_its_twins() -> None:
     ledger = _ledger((HALF_TURN,), None, ())
     assert not ledger.knows(HERE)
@@ -100,9 +106,9 @@ def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() 
     ledger.hold(_found(HERE, 0.9, by_strips=0.8), None)
     ledger.leave(_strips(HALF_TURN @ HERE, 0.95))
     opened = ledger.closed().open
-    assert [c.pose for c in opened] == [HALF_TURN @ HERE, THERE]
+    assert _are([c.pose for c in opened], [HALF_TURN @ HERE, THERE])
     assert opened[0].score == 0.9
-    assert opened[1].score == 0.7 / 0.8 * 0.9
+    assert opened[1].score == pytest.approx(0.7 / 0.8 * 0.9)
 
 
 def test_the_others_that_explain_the_strips_are_the_rest() -> None:
@@ -114,9 +120,9 @@ def test_the_others_that_explain_the_strips_are_the_rest() -> None:
     ledger.pass_over(_strips(away[2], 0.6, misfit=1.5))
     sifted = ledger.closed()
     # One leaves strips unexplained, and one is the pose that holds.
-    assert [c.pose for c in sifted.rest] == [THERE, away[2]]
+    assert _are([c.pose for c in sifted.rest], [THERE, away[2]])
     assert [c.score for c in sifted.rest] == [0.6, 0.6]
-    assert [c.pose for c in sifted.open] == [away[3]]
+    assert _are([c.pose for c in sifted.open], [away[3]])
     assert sifted.others.listed() == [NOWHERE]
 
 

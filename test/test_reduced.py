@@ -209,17 +209,23 @@ def _right_or_in_doubt(estimate: Estimate, pose: Pose2, metres: float, doubt: st
         assert re.search(doubt, estimate.reason), estimate.reason
 
 
-@pytest.mark.parametrize('height', [0.0, 0.0005, 0.0011])
-def test_three_lines_hold_no_pose_where_the_fourth_is_seen_beside_its_place(
-    height: float,
-) -> None:
-    """A pose 0.13 m off, on which three lines lie, and the fourth two pixels from its place."""
+def test_three_lines_hold_no_pose_where_the_fourth_is_seen_beside_its_place() -> None:
+    """A pose 0.13 m off, on which three lines lie, and the fourth two pixels from its place.
+
+    From some heights the search comes to that pose, from others it doubts the strips before:
+    which, turns on the last bits of what OpenCV and numpy give.
+    """
     scene = ideal_scene(640, 0.02)
-    higher = RigidTransform.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, height))
-    stands = dataclasses.replace(
-        scene.mounted(higher @ scene.rig.T_base_mirror),
-        sensor=dataclasses.replace(scene.sensor, jpeg_quality=20))
-    rng = np.random.default_rng([707, 58])
-    pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
-    estimate = Localiser(scene.rig, scene.line_map).process(0, render(stands, pose, rng))
-    _right_or_in_doubt(estimate, pose, 0.03, 'line west is seen .* beside its place')
+    doubt, before = 'line west is seen .* beside its place', r'no pose explains the \d+ line-like'
+    seen = 0
+    for height in np.linspace(0.0, 0.0015, 16):
+        higher = RigidTransform.from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, float(height)))
+        stands = dataclasses.replace(
+            scene.mounted(higher @ scene.rig.T_base_mirror),
+            sensor=dataclasses.replace(scene.sensor, jpeg_quality=20))
+        rng = np.random.default_rng([707, 58])
+        pose = Pose2(*rng.uniform(-1.0, 1.0, 3) * (0.9, 0.6, np.pi))
+        estimate = Localiser(scene.rig, scene.line_map).process(0, render(stands, pose, rng))
+        _right_or_in_doubt(estimate, pose, 0.03, f'{doubt}|{before}')
+        seen += re.search(doubt, estimate.reason) is not None
+    assert seen >= 1, 'none of the images raises the doubt that they are made to raise'

@@ -41,6 +41,7 @@ from nccs_pose.simulation.scene import (
     Scene,
 )
 from nccs_pose.simulation.sensors import compress, expose, irradiate, SensorModel
+from nccs_pose.simulation.textures import wall_colours
 import numpy as np
 import pytest
 
@@ -224,6 +225,16 @@ def test_the_floor_pattern_stays_on_the_map_when_the_robot_moves():
         levels.append(bilinear(expected_image(scene, pose), pixels)[:, 0])
     assert np.corrcoef(levels)[0, 1] > 0.8
     assert levels[0].std() > 5.0
+
+
+def test_textures_are_not_rounded_to_parts_of_a_texel() -> None:
+    """As cv2.remap rounds them before OpenCV 5: images then depend on the version."""
+    room = Room(-2.0, 2.0, -1.5, 1.5)
+    along = np.linspace(3.0, 3.0 + 1.0 / 80.0, 129, dtype=np.float32)  # across one texel
+    steps = np.diff(wall_colours(room, along, np.full(129, 1.0, np.float32))[:, 0])
+    mean = steps.mean()
+    assert abs(mean) > 1e-5
+    np.testing.assert_allclose(steps, mean, atol=0.1 * abs(mean))
 
 
 def test_walls_stand_where_they_are_projected():

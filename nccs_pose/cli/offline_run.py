@@ -107,7 +107,26 @@ def record_line(record: FrameRecord) -> str:
             'candidates': [
                 {'pose_x_y_yaw': candidate.pose.as_array().tolist(), 'score': candidate.score}
                 for candidate in estimate.candidates]}
-    return json.dumps(content) + '\n'
+    return repeatable_json(content) + '\n'
+
+
+def repeatable_json(content: Any, indent: int | None = None) -> str:
+    """Write what was calculated, to ten digits.
+
+    The last bits of a double are not the same in every run: with numpy 1.26 now and then a
+    covariance is 8e-16 of itself off in a second run over the same images.
+    """
+    return json.dumps(_to_ten_digits(content), indent=indent)
+
+
+def _to_ten_digits(content: Any) -> Any:
+    if isinstance(content, float):
+        return float(f'{content:.10g}')
+    if isinstance(content, dict):
+        return {key: _to_ten_digits(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_to_ten_digits(value) for value in content]
+    return content
 
 
 def _run_image(

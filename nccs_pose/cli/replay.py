@@ -30,6 +30,7 @@ from nccs_pose.cli.offline_run import (
     answered_poses,
     FrameRecord,
     record_line,
+    repeatable_json,
     run_events,
 )
 from nccs_pose.cli.paper_localiser import PaperLocaliser
@@ -218,7 +219,7 @@ def _evaluate(
     trust = None if matched is None else consistency(errors.error, matched)
     write_text(
         _beside(args.output, 'evaluation.json'),
-        json.dumps(as_numbers(summary, trust), indent=2) + '\n')
+        repeatable_json(as_numbers(summary, trust), indent=2) + '\n')
     print(summary_table(summary))
     if trust is not None and trust.count:
         print(consistency_table(trust))

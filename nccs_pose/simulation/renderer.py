@@ -93,8 +93,14 @@ def paint(scene: Scene, pose: Pose2) -> np.ndarray:
 
 def _floor_on_map(view: FloorView, pose: Pose2) -> np.ndarray:
     """Give the map's x and y (2, F) float32 of the floor that each pixel sees."""
-    rotation = pose.rotation[:2, :2].astype(np.float32)
-    return rotation @ view.floor.T + pose.translation[:2, None].astype(np.float32)
+    return _turned(pose, view.floor.T) + pose.translation[:2, None].astype(np.float32)
+
+
+def _turned(pose: Pose2, points: np.ndarray) -> np.ndarray:
+    """Turn (2, N) float32; not by a matrix product, which every BLAS rounds in its own way."""
+    (xx, xy), (yx, yy) = pose.rotation[:2, :2].astype(np.float32)
+    x, y = points
+    return np.stack([xx * x + xy * y, yx * x + yy * y])
 
 
 def _light(view: FloorView, look: Appearance, pose: Pose2) -> np.ndarray:
@@ -146,11 +152,10 @@ def _room_colours(
     origin: np.ndarray, direction: np.ndarray, room: Room, pose: Pose2
 ) -> np.ndarray:
     """Give what rays (3, N) of base_link meet on the walls or the ceiling, (N, 3)."""
-    rotation = pose.rotation[:2, :2].astype(np.float32)
     low = np.array([[room.x_min], [room.y_min]], np.float32)
     high = np.array([[room.x_max], [room.y_max]], np.float32)
-    start = rotation @ origin[:2] + pose.translation[:2, None].astype(np.float32)
-    across = rotation @ direction[:2]
+    start = _turned(pose, origin[:2]) + pose.translation[:2, None].astype(np.float32)
+    across = _turned(pose, direction[:2])
     across[np.abs(across) < 1e-6] = 1e-6
     ranges = (np.where(across > 0.0, high, low) - start) / across
     # 0: the wall in the east or west is met first; 1: the one in the north or south.
@@ -171,6 +176,6 @@ def _round_the_room(
     """Give the distance (N,) along the walls south, east, north, west of points (2, N)."""
     x, y = meets[0] - np.float32(room.x_min), meets[1] - np.float32(room.y_min)
     width, depth = np.float32(room.x_max - room.x_min), np.float32(room.y_max - room.y_min)
-    east_west = y + np.where(across[0] > 0.0, width, 2.0 * width + depth)
+    east_west = y + np.where(across[0] > 0.0, width, width + depth + width)
     south_north = x + np.where(across[1] > 0.0, width + depth, np.float32(0.0))
     return np.where(side, south_north, east_west)

@@ -149,15 +149,23 @@ def _ceiling(room: Room) -> np.ndarray:
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Interpolate an image linearly at (N,) positions, in texels; outside, the nearest counts."""
-    # cv2.remap takes images, and their sides must stay below 32768.
-    columns = 1024
-    count = len(u)
-    rows = -(-count // columns)
-    if not rows:
-        return np.empty((0, *image.shape[2:]), np.float32)
-    flat = np.zeros((2, rows * columns), np.float32)
-    flat[0, :count], flat[1, :count] = u, v
-    maps = flat.reshape(2, rows, columns)
-    out = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out.reshape(rows * columns, *image.shape[2:])[:count]
+    """Interpolate an image linearly at (N,) positions, in texels; outside, the nearest counts.
+
+    Not with cv2.remap: up to OpenCV 4 it rounds positions to 1/32 of a texel, which moved a tenth
+    of an image's pixels by up to 20 grey levels. This costs a tenth of a rendered image's time.
+    """
+    rows, columns = image.shape[:2]
+    u, v = np.clip(u, 0, columns - 1), np.clip(v, 0, rows - 1)
+    left, top = np.minimum(u.astype(int), columns - 2), np.minimum(v.astype(int), rows - 2)
+    right, down = u - left.astype(np.float32), v - top.astype(np.float32)
+    if image.ndim == 3:
+        right, down = right[:, None], down[:, None]
+    texels = image.reshape(rows * columns, *image.shape[2:])
+    first = top * columns + left
+
+    def along(at: np.ndarray) -> np.ndarray:
+        here = texels.take(at, axis=0)
+        return here + right * (texels.take(at + 1, axis=0) - here)
+
+    above = along(first)
+    return above + down * (along(first + columns) - above)
