@@ -691,6 +691,20 @@ def test_odometry_bridges_darkness_for_a_while_and_no_longer() -> None:
     assert drive.right(back)
 
 
+@pytest.mark.parametrize('size', [0.85, 1.15])
+def test_wheels_of_another_size_are_no_surer_in_the_dark_than_images_have_shown(
+        size: float) -> None:
+    drive = Drive(SCENE, Pose2(-1.3, -0.6, 0.3))
+    way = 0.08
+    told, missed = Pose2(size * way, 0.0, 0.0), Pose2((1.0 - size) * way, 0.0, 0.0)
+    assert [drive.go(told, missed).state for _ in range(8)] == 8 * [State.TRACKING]
+    for _ in range(9):
+        dark = drive.go(told, missed, change=_black)
+        assert dark.state is State.COASTING
+        error = drive.error(dark)
+        assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
+
+
 @pytest.mark.parametrize('leap', [
     Pose2(0.3, 0.0, 0.0), Pose2(-0.5, 0.5, 0.6), Pose2(0.0, 0.0, 1.5)])
 def test_what_wheels_leap_is_not_coasted_over(leap: Pose2) -> None:
@@ -777,6 +791,18 @@ CELLS = LineMap((*(_line((-8.0, y), (8.0, y)) for y in np.arange(-8.0, 8.5)),
 def _gap(drive: Drive, seconds: float) -> None:
     """No image comes for some time."""
     drive.stamp += round(1e9 * seconds) - PERIOD_NS
+
+
+@pytest.mark.parametrize('seen', [0, 6], ids=['given', 'tracked'])
+def test_wheels_that_slip_in_the_dark_choose_none_of_many_places(seen: int) -> None:
+    drive = Drive(replace(SCENE, line_map=CELLS), Pose2(-2.2, 0.3, 0.2))
+    drive.localiser.set_prior(drive.pose, np.diag([0.03, 0.03, 0.03]) ** 2)
+    for _ in range(seen):
+        assert drive.right(drive.go(Pose2(0.1, 0.0, 0.0)))
+    # They spin: 3.75 m are told where it goes 3 m, and the next cell is nearer to that.
+    for _ in range(30):
+        drive.go(Pose2(0.125, 0.0, 0.0), Pose2(-0.025, 0.0, 0.0), change=_black)
+    assert drive.go().state is State.AMBIGUOUS
 
 
 @pytest.mark.parametrize(('line_map', 'start', 'step', 'gap', 'left'), [

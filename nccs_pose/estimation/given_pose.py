@@ -64,7 +64,8 @@ class GivenPose:
         expected: Prediction | None = self._told
         last = self._course.last
         if last is not None and last.stamp_ns != stamp_ns:
-            carried = self._course.at(stamp_ns, wheels)
+            # No image has confirmed the wheels since it was given.
+            carried = self._course.at(stamp_ns, wheels, doubted=True)
             expected = None if carried is None else replace(carried, is_given=True)
         # Without wheels what it may have driven since counts from the first image without.
         if expected is not None and (last is None or wheels is not None):

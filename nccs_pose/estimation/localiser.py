@@ -140,8 +140,9 @@ class Localiser:
         self._course = Course()
         self._given: GivenPose | None = None
         self._ever_tracked = False
-        # Whether an image has shown another place than expected since the last pose.
-        self._shaken = False
+        # Whether an image has given no pose, or has shown another place than expected, since the
+        # last pose.
+        self._blind = self._shaken = False
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -202,7 +203,9 @@ class Localiser:
             self._given = given
         watch = Stopwatch()
         wheels = self._odometry.at(stamp_ns)
-        prediction = self._course.at(stamp_ns, wheels)
+        prediction = self._course.at(stamp_ns, wheels, doubted=self._blind)
+        # Until it has given a pose.
+        self._blind = True
         frame = Frame(stamp_ns, image, wheels, prediction, watch)
         watch.lap('predict')
         if prediction is None:
@@ -335,7 +338,8 @@ class Localiser:
         if prior is None:
             self._follower.begin()
         self._open, self._given, self._refuted_ns = OpenPoses(), None, None
-        self._shaken, self._ever_tracked = False, True
+        self._blind = self._shaken = False
+        self._ever_tracked = True
         return answers.tracking(frame, reason, held or [found], found, covariance, unobserved)
 
     def _without_pose(self, frame: Frame, sight: Sight, refused: Refused) -> Estimate:
@@ -352,6 +356,8 @@ class Localiser:
         doubted = None if refused.alignment is None else Doubted(
             refused.alignment.pose, refused.alignment.points)
         if prediction is not None and not self._shaken:
+            # Darkness alone is nothing against the wheels.
+            prediction = self._course.at(frame.stamp_ns, frame.wheels) or prediction
             seconds = self._course.seconds_to(frame.stamp_ns)
             if may_coast(prediction, seconds, self._options):
                 return answers.coasting(frame, prediction, seconds, missing, doubted)
