@@ -699,6 +699,20 @@ def test_odometry_bridges_darkness_for_a_while_and_no_longer() -> None:
     assert drive.right(back)
 
 
+@pytest.mark.parametrize('size', [0.85, 1.15])
+def test_wheels_of_another_size_are_no_surer_in_the_dark_than_images_have_shown(
+        size: float) -> None:
+    drive = Drive(SCENE, Pose2(-1.3, -0.6, 0.3))
+    way = 0.08
+    told, missed = Pose2(size * way, 0.0, 0.0), Pose2((1.0 - size) * way, 0.0, 0.0)
+    assert [drive.go(told, missed).state for _ in range(8)] == 8 * [State.TRACKING]
+    for _ in range(9):
+        dark = drive.go(told, missed, change=_black)
+        assert dark.state is State.COASTING
+        error = drive.error(dark)
+        assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
+
+
 @pytest.mark.parametrize('leap', [
     Pose2(0.3, 0.0, 0.0), Pose2(-0.5, 0.5, 0.6), Pose2(0.0, 0.0, 1.5)])
 def test_what_wheels_leap_is_not_coasted_over(leap: Pose2) -> None:

@@ -36,6 +36,7 @@ import pytest
 
 SECOND = 10**9
 START = Pose2(3.0, -2.0, 2.9)
+AHEAD = Twist(0.8, 0.0)
 
 
 def _track(
@@ -438,3 +439,107 @@ def test_a_course_goes_by_the_wheels_until_their_reckoning_breaks_off() -> None:
     broken = course.without_odometry().at(SECOND // 10, Wheels(Pose2(0.1, 0.0, 0.0)))
     assert broken is not None and not broken.by_odometry
     assert broken.pose == START
+
+
+def _held_against_images(
+    size: float = 1.0, size_of_turn: float = 1.0, bend: float = 0.0, *,
+    twist: Twist = AHEAD, sigma: float = 0.0005, seconds: float = 2.0,
+) -> Course:
+    """A course at 10 Hz of wheels that tell so much more than the robot drives and turns.
+
+    :param bend: what they turn too much, rad/m.
+    :param sigma: of the images' poses, metres and rad.
+    """
+    course, rng = Course(), np.random.default_rng(4)
+    wrong = Twist(size * twist.forward, size_of_turn * twist.turn + bend * twist.forward)
+    for k in range(round(10 * seconds) + 1):
+        t = 0.1 * k
+        seen = Pose2.from_array(
+            integrate_twist(START, twist, t).as_array() + sigma * rng.standard_normal(3))
+        course = course.after(
+            k * SECOND // 10, seen, sigma**2 * np.eye(3), _rolled(wrong, t), is_fixed=True)
+    return course
+
+
+def _rolled(twist: Twist, t: float) -> Wheels:
+    return Wheels(
+        integrate_twist(Pose2(), twist, t), abs(twist.forward) * t, abs(twist.turn) * t)
+
+
+@pytest.mark.parametrize('size', [0.8, 0.85, 1.15, 1.2])
+@pytest.mark.parametrize('forward', [0.8, -0.8])
+def test_what_images_have_shown_of_the_wheels_way_is_reckoned_with(
+        size: float, forward: float) -> None:
+    twist = Twist(forward, 0.0)
+    course = _held_against_images(size, twist=twist)
+    # Of what the wheels tell, so much is too much or too little.
+    assert course.errors.flaw.way == pytest.approx(abs(size - 1.0) / size, rel=0.15)
+    predicted = course.at(39 * SECOND // 10, _rolled(Twist(size * forward, 0.0), 3.9))
+    assert predicted is not None
+    error = predicted.pose.minus(integrate_twist(START, twist, 3.9))
+    assert error @ np.linalg.solve(predicted.carried, error) < 3.0**2
+    assert predicted.is_vague
+
+
+@pytest.mark.parametrize(('about', 'twist'), [
+    ({'size_of_turn': 1.2}, Twist(0.0, 1.0)), ({'size_of_turn': 0.8}, Twist(0.0, -1.0)),
+    ({'size': 1.2, 'size_of_turn': 1.2}, Twist(0.9, 1.2)), ({'bend': 0.4}, Twist(0.8, 0.0))])
+def test_what_images_have_shown_of_the_wheels_turn_is_reckoned_with(
+        about: dict[str, float], twist: Twist) -> None:
+    course = _held_against_images(**about, twist=twist, seconds=3.0)
+    size, size_of_turn = about.get('size', 1.0), about.get('size_of_turn', 1.0)
+    wrong = Twist(
+        size * twist.forward, size_of_turn * twist.turn + about.get('bend', 0.0) * twist.forward)
+    predicted = course.at(4 * SECOND, _rolled(wrong, 4.0))
+    assert predicted is not None
+    error = predicted.pose.minus(integrate_twist(START, twist, 4.0))
+    assert error @ np.linalg.solve(predicted.carried, error) < 3.0**2
+
+
+@pytest.mark.parametrize('about', [
+    # It stands, creeps, drives, and turns, under poses that are 5 mm and 5 mrad off.
+    {'twist': Twist(0.0, 0.0)}, {'twist': Twist(0.03, 0.0)}, {'twist': Twist(0.6, 0.0)},
+    {'twist': Twist(0.3, 1.0)}, {'twist': Twist(0.6, 0.0), 'size': 1.02}])
+def test_what_images_err_by_is_not_laid_on_the_wheels(about: dict) -> None:
+    for seconds in (0.5, 1.0, 3.0, 10.0):
+        course = _held_against_images(**about, sigma=0.005, seconds=seconds)
+        assert course.errors.flaw.way < 0.02
+        assert course.errors.flaw.turn < 0.02
+        assert course.errors.flaw.bend < 0.02
+
+
+def test_a_robot_that_is_carried_away_does_not_speak_against_its_wheels() -> None:
+    new = Course().after(0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
+    for course in (_held_against_images(), new):
+        last = course.last
+        assert last is not None and last.odometry is not None
+        wheels = Wheels(last.odometry.pose @ Pose2(0.2, 0.0, 0.0), last.odometry.way + 0.2)
+        elsewhere = last.pose @ Pose2(-1.5, 0.0, 0.0)
+        after = course.after(
+            last.stamp_ns + SECOND, elsewhere, 1e-6 * np.eye(3), wheels, is_fixed=True)
+        assert after.errors.flaw == course.errors.flaw
+        assert after.errors.begin is after.last
+
+
+def test_what_wheels_erred_by_once_is_forgotten_on_the_way() -> None:
+    course = _held_against_images(1.2)
+    last = course.last
+    assert last is not None and last.odometry is not None
+    for k in range(1, 61):
+        step = Pose2(0.1 * k, 0.0, 0.0)
+        wheels = Wheels(last.odometry.pose @ step, last.odometry.way + 0.1 * k)
+        course = course.after(
+            last.stamp_ns + k * SECOND // 10, last.pose @ step, 1e-6 * np.eye(3), wheels,
+            is_fixed=True)
+    assert course.errors.flaw.way < 0.02
+
+
+def test_wheels_that_no_image_confirms_are_vague_after_a_while() -> None:
+    course = Course().after(0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
+    for way, vague in ((0.1, False), (1.2, True)):
+        wheels = Wheels(Pose2(way, 0.0, 0.0), way)
+        sure, doubted = (
+            course.at(SECOND, wheels, doubted=doubted) for doubted in (False, True))
+        assert sure is not None and doubted is not None
+        assert not sure.is_vague
+        assert doubted.is_vague is vague

@@ -21,6 +21,7 @@ import math
 
 from nccs_pose.estimation.motion import by_odometry, by_velocity, PAST, Prediction, Track
 from nccs_pose.estimation.odometry import Wheels
+from nccs_pose.estimation.wheel_errors import UNCHECKED, WheelErrors
 from nccs_pose.geometry.pose import Array, Pose2
 
 
@@ -30,22 +31,29 @@ class Course:
 
     :ivar last: the last pose; None before the first.
     :ivar past: the poses before it, in order, as far back as velocities lead to the last one.
+    :ivar errors: what the images have shown of how far the wheels err.
     """
 
     last: Track | None = None
     past: tuple[Track, ...] = ()
+    errors: WheelErrors = UNCHECKED
 
-    def at(self, stamp_ns: int, wheels: Wheels | None) -> Prediction | None:
+    def at(
+        self, stamp_ns: int, wheels: Wheels | None, *, doubted: bool = False,
+    ) -> Prediction | None:
         """Where the robot should be: by the wheels, or by its velocity where they are silent.
 
         :param wheels: what they say at the stamp; None without odometry.
+        :param doubted: whether images since the last pose speak against what they say.
         :returns: None without any pose, or where the last one is too long ago.
         """
         last = self.last
         if last is None:
             return None
         if last.odometry is not None and wheels is not None:
-            return by_odometry(last.pose, last.covariance, last.odometry, wheels, last.seen_way)
+            flaw = self.errors.flaw.doubted() if doubted else self.errors.flaw
+            return by_odometry(
+                last.pose, last.covariance, last.odometry, wheels, last.seen_way, flaw)
         return by_velocity(self.past, last, stamp_ns)
 
     def seconds_to(self, stamp_ns: int) -> float:
@@ -71,11 +79,17 @@ class Course:
         track = Track(stamp_ns, pose, covariance, wheels, seen_ns, seen_way)
         # A step that also sets right what the images before had left open is no velocity.
         sets_right = is_fixed and last is not None and last.seen_ns < last.stamp_ns
+        errors = self.errors
+        # A robot that was found elsewhere has not come there on its wheels.
+        if is_jump or last is None:
+            errors = errors.begun_at(track if is_fixed else None)
+        elif is_fixed:
+            errors = errors.after(track)
         if last is None or is_jump or sets_right:
-            return Course(track)
-        return Course(track, (*self.past, last)[-PAST:])
+            return Course(track, (), errors)
+        return Course(track, (*self.past, last)[-PAST:], errors)
 
     def without_odometry(self) -> Course:
         """The course once the wheels' reckoning has broken off: no step leads on from there."""
         return self if self.last is None else replace(
-            self, last=replace(self.last, odometry=None))
+            self, last=replace(self.last, odometry=None), errors=self.errors.begun_at(None))

@@ -205,7 +205,7 @@ class Localiser:
             self._given = given
         watch = Stopwatch()
         wheels = self._odometry.at(stamp_ns)
-        prediction = self._course.at(stamp_ns, wheels)
+        prediction = self._course.at(stamp_ns, wheels, doubted=self._shaken)
         frame = Frame(stamp_ns, image, wheels, prediction, watch)
         watch.lap('predict')
         if prediction is None:

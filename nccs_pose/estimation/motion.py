@@ -37,6 +37,8 @@ _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
 # Besides, they may be larger or smaller than they are taken for, by this part.
 _SCALE = 0.02
+# Where images speak against what they tell, they may have slipped or spun by this part.
+_SLIP = 0.1
 # Without odometry: the speed and the acceleration that a robot may have, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
@@ -67,6 +69,24 @@ class Track:
     odometry: Wheels | None
     seen_ns: int
     seen_way: float | None = None
+
+
+@dataclass(frozen=True)
+class Flaw:
+    """What wheels err by, in proportion to how far they roll; one sigma.
+
+    :ivar way: as a part of the way.
+    :ivar turn: of the yaw, as a part of the turn.
+    :ivar bend: of the yaw, for every metre, as of wheels of two sizes, rad/m.
+    """
+
+    way: float = 0.0
+    turn: float = 0.0
+    bend: float = 0.0
+
+    def doubted(self) -> Flaw:
+        """Of wheels against which images speak."""
+        return Flaw(max(self.way, _SLIP), max(self.turn, _SLIP), self.bend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +136,13 @@ class Prediction:
         return narrowed if is_definite(narrowed) else covariance
 
 
+NO_FLAW = Flaw()
 FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])
 
 
 def by_odometry(
     pose: Pose2, covariance: Array, before: Wheels, after: Wheels,
-    seen_way: float | None = None,
+    seen_way: float | None = None, flaw: Flaw = NO_FLAW,
 ) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two moments.
 
@@ -131,6 +152,7 @@ def by_odometry(
 
     :param seen_way: how far they had rolled when the pose was last fixed in every direction,
         metres; None for when they were asked first.
+    :param flaw: what they are known to err by.
     """
     step = before.pose.inverse() @ after.pose
     moved = pose @ step
@@ -138,12 +160,15 @@ def by_odometry(
     angle = max(abs(step.yaw), after.turn - before.turn)
     faster, faster_yaw = (a * after.unheard for a in _ACCELERATION)
     open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
-    scale = _SCALE * math.sqrt(distance * (distance + 2.0 * open_way))
+    scale = max(flaw.way, _SCALE) * math.sqrt(distance * (distance + 2.0 * open_way))
     leap, spin = (b - a for a, b in zip(before.leapt, after.leapt))
+    swerve = max(flaw.turn * angle, flaw.bend * distance)
     sigma = math.hypot(
-        _PER_METRE[0] * math.sqrt(distance), scale, faster, leap, spin * distance)
+        _PER_METRE[0] * math.sqrt(distance), scale, faster, leap, spin * distance,
+        0.5 * swerve * distance)
     sigma_yaw = math.hypot(
-        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin)
+        _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin,
+        swerve)
     return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
 
 
