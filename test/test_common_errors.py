@@ -129,7 +129,7 @@ def test_errors_count_by_what_they_do_to_the_pose(near: float, far: float) -> No
     assert np.mean(squares) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 1800.0))
 
 
-def test_claims_of_few_stations_are_about_as_large_as_of_many() -> None:
+def test_correlations_that_few_stations_show_widen_the_claim_by_their_scatter() -> None:
     per_line, group, share = 24, 6, 0.6
     label = np.repeat(np.arange(LINES), per_line)
     along = np.tile(np.linspace(-1.0, 1.0, per_line), LINES)
@@ -145,23 +145,9 @@ def test_claims_of_few_stations_are_about_as_large_as_of_many() -> None:
             [1.0, share], [1.0], rng.standard_normal((LINES, per_line + 1)))[:, 1:].ravel()
         inverses.append(1.0 / common_variance(
             error - pose @ (pose.T @ error), leverage, label, first))
-    told = float(np.mean(inverses)) * together * math.exp(2.2 * correlation**2)
-    assert 1.0 < told < 1.1
-
-
-def test_chance_among_neighbours_hardly_scatters_the_claim() -> None:
-    # As on a floor with texture, of which what is near tells most of the pose.
-    near = np.where(np.abs(ALONG) < 0.4, 1.0, 0.3)
-    pose = np.linalg.qr(POSE * near[:, None])[0]
-    leverage = np.square(pose).sum(axis=1)
-    rng, claims = np.random.default_rng(3), []
-    for _ in range(600):
-        error = lfilter([1.0, 0.35, 0.1], [1.0], rng.standard_normal((LINES, PER_LINE + 3)))
-        error = error[:, 3:].ravel()
-        claims.append(common_variance(
-            error - pose @ (pose.T @ error), leverage, LABEL, FIRST))
-    # The sums of so few groups scatter by 0.29 themselves, of independent errors.
-    assert float(np.std(np.log(claims))) < 0.4
+    # Too large by 15 % still, as sums and correlations scatter together; by 20 % without.
+    told = float(np.mean(inverses)) * together * math.exp(2.5 * correlation**2)
+    assert 1.0 < told < 1.17
 
 
 def test_ends_of_two_lines_are_no_neighbours() -> None:
@@ -178,7 +164,7 @@ def test_ends_of_two_lines_are_no_neighbours() -> None:
 def test_few_residuals_are_no_obstacle() -> None:
     label = np.array([0, 1, 1, 2, 2, 2])
     claimed = common_variance(np.full(6, 0.5), np.full(6, 0.5), label, np.array([0, 1, 3]))
-    assert 0.5 < claimed < 8.0
+    assert 0.5 < claimed < 6.0
     assert common_misfit(np.full(6, 0.05), label) == 0.0
 
 

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 # What is alike among neighbours is so among whole lines too, by this power of e times the square
-# of their correlation; from few stations that is not known, and counts to a limit.
-_REDDER = 2.2
+# of their correlations' sum; from few stations that is not known, and counts to a limit.
+_REDDER = 2.5
 _LIMIT = 0.7
 # A claim from sums fewer than so many would be too uncertain for any correction.
 _LEAST_FREEDOM = 5.0
@@ -56,11 +56,10 @@ def common_variance(
 
     Errors that are alike farther than a group reaches hide in the pose, which takes for its own
     what whole lines have in common. They go with such as show: floors with texture and coarse
-    JPEG have both. With a correlation c of neighbours, on simulated images of all kinds, sums
-    over lines came to about exp(2.2 c^2) times the variance of sums over groups. Within one kind
-    it is chance that tells one image's correlation from another's. So of all that could tell how
-    far errors are alike, the one with the least scatter is taken: of next neighbours only, and
-    of all stations as one, whatever they do to the pose.
+    JPEG have both. With correlations c_k between stations k apart, on simulated images of all
+    kinds, sums over lines had about exp(2.5 (c_1 + c_2)^2) times the variance of sums over groups.
+    Where that scatters it makes the inverse too large as well: an exponent with a variance of s^2
+    by exp(s^2 / 2).
 
     :param residual: of the stations (N,), whitened, along each line in order.
     :param leverage: how far each one's error moves its own fit (N,), from 0 to 1; 0 of one that
@@ -82,14 +81,17 @@ def common_variance(
     # One group more, of independent errors: what few groups say is not all.
     own = fitted / len(first)
     together = (_square(sums) + own * variance) / (left + own) * freedom / (freedom - 2.0)
-    along = (label[1:] == label[:-1]).astype(float)
-    shown = float(residual[1:].dot(residual[:-1] * along)) / max(float(along.sum()), 1.0)
-    single = max(_square(residual) / len(residual), 1e-12)
-    # The fit takes out of a product what it takes out of any pair on one line.
-    alike = shown / single + fitted / len(residual) * together / variance
-    square = min(max(alike, 0.0), _LIMIT)**2
+    # Of three neighbours the first with the two others.
+    along = (label[2:] == label[:-2]).astype(float)
+    products = float((error[1:-1] + error[2:]).dot(error[:-2] * along))
+    shown = products / max(float(leverage[:-2].dot(along)), 1e-12)
+    alike = min(max((shown + 2.0 * taken * together) / variance, 0.0), _LIMIT)
     # Less what independent errors of so many stations show by chance.
-    return together * math.exp(_REDDER * max(square - 1.0 / len(residual), 0.0))
+    chance = 2.0 * taken / fitted
+    square = max(alike**2 - chance, 0.0)
+    # The correlations scatter by as much; at most, as if all up to the limit were equally likely.
+    scatter = min(4.0 * square * chance, _LIMIT**4 / 12.0)
+    return together * math.exp(_REDDER * square + 0.5 * _REDDER**2 * scatter)
 
 
 def sums_of_neighbours(
