@@ -143,7 +143,7 @@ class Localiser:
         self._ever_tracked = False
         # Whether an image has shown another place than expected since the last pose.
         self._shaken = False
-        # Images in a row that agree with what is expected, but hide too much to give a pose.
+        # Images in a row since then that agree with what was expected, but hide too much for one.
         self._agreeing = 0
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
@@ -355,11 +355,11 @@ class Localiser:
         if prediction is not None:
             self._shaken |= contradicted or bool(self._open) or shows_another_place(
                 sight, prediction, self._searcher)
+        if prediction is not None and self._shaken:
             agrees = not (self._open or self._history.doubted) and shows_this_place(
                 sight, prediction, refused.alignment, self._searcher, self._options)
             self._agreeing = self._agreeing + 1 if agrees else 0
-            if self._agreeing >= LEAST_IMAGES:
-                self._shaken = False
+            self._shaken = self._agreeing < LEAST_IMAGES
         missing = what_is_missing(sight.segments) if against is None else against.words
         doubted = None if refused.alignment is None else Doubted(
             refused.alignment.pose, refused.alignment.points)
