@@ -21,6 +21,7 @@ parts are wired to the lifecycle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 import gc
 import math
 import time
@@ -56,6 +57,33 @@ from std_srvs.srv import SetBool, Trigger
 TRANSFORM_RETRY_PERIOD = 0.02
 
 
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What a configuration makes, and cleaning up forgets."""
+
+    rig: Rig
+    localiser: Localiser
+    keeper: PoseKeeper
+    watch: CalibrationWatch
+    outputs: Outputs
+
+
+@dataclass(frozen=True, eq=False)
+class _Latest:
+    """What the images since the activation came to.
+
+    :ivar estimate: of the last one; None before any, and once a user has had it forgotten.
+    :ivar image_stamp_ns: of the last one.
+    :ivar pose_stamp_ns: of the last one whose pose was published.
+    :ivar latency_s: from the last one's arrival until it was answered, seconds.
+    """
+
+    estimate: Estimate | None = None
+    image_stamp_ns: int | None = None
+    pose_stamp_ns: int | None = None
+    latency_s: float = 0.0
+
+
 class LocaliserNode(LifecycleNode):
     """Wires topics, services and parameters to a Localiser."""
 
@@ -63,17 +91,10 @@ class LocaliserNode(LifecycleNode):
         super().__init__('localiser', **node_arguments)
         answer_every_request(self)
         self._tally = diagnostics.Tally()
-        self._rig: Rig | None = None
-        self._localiser: Localiser | None = None
-        self._outputs: Outputs | None = None
-        self._stream: ImageStream | None = None
-        self._keeper: PoseKeeper | None = None
+        self._parts: _Parts | None = None
         self._inputs: Inputs | None = None
-        self._watch: CalibrationWatch | None = None
-        self._estimate: Estimate | None = None
-        self._image_stamp_ns: int | None = None
-        self._pose_stamp_ns: int | None = None
-        self._latency_s = 0.0
+        self._stream: ImageStream | None = None
+        self._latest = _Latest()
         self._paused = False
         self._configuration_problem = ''
         self._shown: tuple[Any, ...] = ()
@@ -159,26 +180,27 @@ class LocaliserNode(LifecycleNode):
                 raise OptionError(
                     f'parameter {name} is not set; a parameter file has to name this node, '
                     f'{self.get_fully_qualified_name()}, or /**')
-        self._rig = rig = load_rig(resolve(self._options.rig_file))
+        rig = load_rig(resolve(self._options.rig_file))
         line_map = load_map(resolve(self._options.map_file))
         if line_map.frame != self._options.map_frame:
             raise OptionError(
                 f'map_frame = {self._options.map_frame!r}, but {self._options.map_file} has '
                 f'frame: {line_map.frame}')
-        self._localiser = Localiser(rig, line_map, estimator)
-        self._outputs = Outputs(self, lambda: self._options, rig, line_map, self._refuse)
-        self._keeper = PoseKeeper(self._options, line_map, self.get_logger())
-        self._watch = CalibrationWatch(rig, line_map)
+        self._parts = _Parts(
+            rig, Localiser(rig, line_map, estimator),
+            PoseKeeper(self._options, line_map, self.get_logger()),
+            CalibrationWatch(rig, line_map),
+            # The last: nothing is left on the graph where another cannot be made.
+            Outputs(self, lambda: self._options, rig, line_map, self._refuse))
 
     def _activate(self) -> None:
-        assert self._localiser is not None and self._outputs is not None
-        assert self._keeper is not None and self._rig is not None
-        self._localiser.reset()
-        self._outputs.transforms.forget()
-        self._estimate = self._image_stamp_ns = self._pose_stamp_ns = None
-        self._keeper.offer(self._localiser)
+        assert self._parts is not None
+        parts, self._latest = self._parts, _Latest()
+        parts.localiser.reset()
+        parts.outputs.transforms.forget()
+        parts.keeper.offer(parts.localiser)
         self._inputs = Inputs(
-            self, lambda: self._options, self._rig.camera, self._localiser, self._keeper,
+            self, lambda: self._options, parts.rig.camera, parts.localiser, parts.keeper,
             self._refuse, self._report_diagnostics)
         self._stream = ImageStream(
             self, self._options.image_transport, self._tally, self._on_frame,
@@ -195,14 +217,13 @@ class LocaliserNode(LifecycleNode):
         if self._inputs is not None:
             self._inputs.close()
             self._inputs = None
-        if self._keeper is not None:
-            self._keeper.save()
+        if self._parts is not None:
+            self._parts.keeper.save()
 
     def _clean_up(self) -> None:
-        if self._outputs is not None:
-            self._outputs.close()
-        self._outputs = self._localiser = self._keeper = self._watch = self._rig = None
-        self._estimate = self._image_stamp_ns = self._pose_stamp_ns = None
+        if self._parts is not None:
+            self._parts.outputs.close()
+        self._parts, self._latest = None, _Latest()
 
     def _shut_down(self) -> None:
         try:
@@ -213,40 +234,41 @@ class LocaliserNode(LifecycleNode):
     # Input
 
     def _on_frame(self, stamp_ns: int, frame_id: str, image: NDArray[np.uint8]) -> None:
-        assert self._localiser is not None and self._outputs is not None
-        assert self._stream is not None and self._inputs is not None
-        assert self._keeper is not None and self._watch is not None
+        assert self._parts is not None and self._inputs is not None
+        assert self._stream is not None
         if self._paused:
             return
+        localiser, outputs, before = self._parts.localiser, self._parts.outputs, self._latest
         self._inputs.use_waiting_odometry()
-        estimate = self._localiser.process(stamp_ns, image)
-        if self._image_stamp_ns is not None and stamp_ns < self._image_stamp_ns:
-            back = 1e-9 * (self._image_stamp_ns - stamp_ns)
+        estimate = localiser.process(stamp_ns, image)
+        self._latest = replace(before, estimate=estimate, image_stamp_ns=stamp_ns)
+        if before.image_stamp_ns is not None and stamp_ns < before.image_stamp_ns:
+            back = 1e-9 * (before.image_stamp_ns - stamp_ns)
             self._tally.resets += 1
-            self._outputs.transforms.forget()
-            self._pose_stamp_ns = None
+            outputs.transforms.forget()
+            self._latest = replace(self._latest, pose_stamp_ns=None)
             self.get_logger().warning(
                 f'the stamps jumped back by {back:.3f} s: the tracker starts anew')
-        self._estimate, self._image_stamp_ns = estimate, stamp_ns
-        if not self._withheld() and self._outputs.publish(estimate):
+        if not self._withheld() and outputs.publish(estimate):
             self._tally.answered += 1
-            self._pose_stamp_ns = stamp_ns
-            self._keeper.remember(estimate)
-        self._latency_s = time.monotonic() - self._stream.arrived
-        self._outputs.draw(estimate, frame_id, image, self._localiser.options)
-        self._watch.look(estimate)
+            self._latest = replace(self._latest, pose_stamp_ns=stamp_ns)
+            self._parts.keeper.remember(estimate)
+        self._latest = replace(
+            self._latest, latency_s=time.monotonic() - self._stream.arrived)
+        outputs.draw(estimate, frame_id, image, localiser.options)
+        self._parts.watch.look(estimate)
         if self._shown != self._summary():
             self._report_diagnostics()
 
     def _on_relocalise(
         self, request: Trigger.Request, response: Trigger.Response,
     ) -> Trigger.Response:
-        if self._localiser is None:
+        if self._parts is None:
             response.success, response.message = False, 'the node is not configured'
             return response
-        self._localiser.relocalise()
+        self._parts.localiser.relocalise()
         # What the last image said is forgotten.
-        self._estimate = None
+        self._latest = replace(self._latest, estimate=None)
         self._report_diagnostics()
         response.success, response.message = True, 'searching everywhere from the next image on'
         return response
@@ -261,8 +283,8 @@ class LocaliserNode(LifecycleNode):
 
     def _on_live_change(self, options: NodeOptions, estimator: LocaliserOptions) -> None:
         self._options = options
-        if self._localiser is not None:
-            self._localiser.update_options(estimator)
+        if self._parts is not None:
+            self._parts.localiser.update_options(estimator)
 
     def _refuse(self, cause: str, words: str) -> None:
         self._tally.refuse(cause, words)
@@ -293,22 +315,24 @@ class LocaliserNode(LifecycleNode):
 
     def _odometry_lag(self) -> float:
         """Of the last sample of odometry behind the last image, s; NaN without either."""
-        if self._localiser is None or self._estimate is None:
+        if self._parts is None or self._latest.estimate is None:
             return math.nan
-        last_ns = self._localiser.last_odometry_ns
-        return math.nan if last_ns is None else 1e-9 * (self._estimate.stamp_ns - last_ns)
+        last_ns = self._parts.localiser.last_odometry_ns
+        return (math.nan if last_ns is None
+                else 1e-9 * (self._latest.estimate.stamp_ns - last_ns))
 
     def _summary(self) -> tuple[Any, ...]:
         """What a change of makes a report due at once."""
-        return self._estimate.state if self._estimate else None, self._problem()
+        estimate = self._latest.estimate
+        return estimate.state if estimate else None, self._problem()
 
     def _on_retry(self) -> None:
-        if self._outputs is not None:
-            self._outputs.transforms.retry(self.get_clock().now().nanoseconds)
+        if self._parts is not None:
+            self._parts.outputs.transforms.retry(self.get_clock().now().nanoseconds)
 
     def _on_period(self) -> None:
-        if self._keeper is not None:
-            self._keeper.save_if_due()
+        if self._parts is not None:
+            self._parts.keeper.save_if_due()
         self._report_diagnostics()
 
     def _report_diagnostics(self) -> None:
@@ -317,16 +341,17 @@ class LocaliserNode(LifecycleNode):
         except InvalidHandle:
             return
         now = self.get_clock().now()
-        age = (math.nan if self._pose_stamp_ns is None
-               else 1e-9 * (now.nanoseconds - self._pose_stamp_ns))
+        latest = self._latest
+        age = (math.nan if latest.pose_stamp_ns is None
+               else 1e-9 * (now.nanoseconds - latest.pose_stamp_ns))
         name, tally = self.get_fully_qualified_name().lstrip('/'), self._tally
         silence = '' if self._stream is None else self._stream.problem(
             self._options.silence_warning)
-        others = '' if self._outputs is None else self._outputs.others()
+        others = '' if self._parts is None else self._parts.outputs.others()
         if others:
             self.get_logger().warning(others, throttle_duration_sec=60.0)
         statuses = [diagnostics.warned(diagnostics.pose_status(
-            name, label, self._problem(), silence, self._estimate, age, self._odometry_lag()),
+            name, label, self._problem(), silence, latest.estimate, age, self._odometry_lag()),
             others)]
         if self._stream is not None:
             troubles = sum(tally.refused.values()) + sum(tally.errors.values())
@@ -335,10 +360,10 @@ class LocaliserNode(LifecycleNode):
                     name, self._stream.topic, self._stream.publishers, tally, silence,
                     troubles - self._reported[0], tally.lost - self._reported[1]),
                 diagnostics.time_status(
-                    name, self._estimate, self._stream.decode_s, self._latency_s)]
+                    name, latest.estimate, self._stream.decode_s, latest.latency_s)]
             self._reported = (troubles, tally.lost)
-        if self._watch is not None:
-            statuses.append(self._watch.status(name))
+        if self._parts is not None:
+            statuses.append(self._parts.watch.status(name))
         self._shown = self._summary()
         self._diagnostics.publish(diagnostics.diagnostic_array(now.to_msg(), statuses))
 

@@ -51,7 +51,7 @@ def deliver(publisher: Any, *messages: Any) -> None:
 def test_odometry_that_arrived_before_an_image_is_used_before_it(pair, monkeypatch):
     seen: list[int] = []
     before_image: list[int] = []
-    localiser = pair.node._localiser
+    localiser = pair.node._parts.localiser
     process = localiser.process
     monkeypatch.setattr(localiser, 'add_odometry', lambda stamp, pose: seen.append(stamp))
     monkeypatch.setattr(localiser, 'process', lambda stamp, image: (
@@ -88,7 +88,7 @@ def test_an_error_that_is_nobodys_fault_outside_is_no_refusal(pair, monkeypatch)
     def fail(*_: object) -> None:
         raise GeometryError('a mistake of our own')
 
-    monkeypatch.setattr(pair.node._localiser, 'add_odometry', fail)
+    monkeypatch.setattr(pair.node._parts.localiser, 'add_odometry', fail)
     odometry = odometry_message(1, 'odom', 'base_link', Pose2(), 0.0, 0.0)
     with pytest.raises(GeometryError):
         pair.node._inputs._odometry.callback(serialize_message(odometry))
@@ -97,7 +97,7 @@ def test_an_error_that_is_nobodys_fault_outside_is_no_refusal(pair, monkeypatch)
 
 def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
     used: list[int] = []
-    localiser = pair.node._localiser
+    localiser = pair.node._parts.localiser
     process = localiser.process
     images = pair.publisher(Image, 'image', 2)
     monkeypatch.setattr(localiser, 'process', lambda stamp, image: (
@@ -131,9 +131,9 @@ def test_a_hiccup_is_caught_up_with_and_a_backlog_is_not(pair, monkeypatch):
     'pair', [{'qos_overrides./image.subscription.depth': 5}], indirect=True)
 def test_a_depth_of_the_users_choice_is_taken_at_its_word(pair, monkeypatch):
     used: list[int] = []
-    process = pair.node._localiser.process
+    process = pair.node._parts.localiser.process
     images = pair.publisher(Image, 'image', 5)
-    monkeypatch.setattr(pair.node._localiser, 'process', lambda stamp, image: (
+    monkeypatch.setattr(pair.node._parts.localiser, 'process', lambda stamp, image: (
         used.append(stamp // 10_000_000), process(stamp, image))[1])
     deliver(images, *map(black, range(1, 6)))
     pair.wait(lambda: len(used) == 5)

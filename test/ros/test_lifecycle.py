@@ -98,18 +98,18 @@ def test_where_the_stamps_begin_anew_what_was_before_is_forgotten(
         pair, arena, monkeypatch, relocalised):
     forgotten: list[int] = []
     monkeypatch.setattr(
-        pair.node._outputs.transforms, 'forget', lambda: forgotten.append(
+        pair.node._parts.outputs.transforms, 'forget', lambda: forgotten.append(
             pair.node._tally.answered))
     pair.node.trigger_deactivate()
     pair.node.trigger_activate()
     assert forgotten == [0]
     image = arena[0].image
     pair.node._on_frame(30_000_000_000, 'camera', image)
-    assert pair.node._pose_stamp_ns == 30_000_000_000
+    assert pair.node._latest.pose_stamp_ns == 30_000_000_000
     if relocalised:
         pair.node._on_relocalise(Trigger.Request(), Trigger.Response())
     pair.node._on_frame(5_000_000_000, 'camera', np.zeros_like(image))
-    assert pair.node._pose_stamp_ns is None
+    assert pair.node._latest.pose_stamp_ns is None
     pair.node._on_frame(5_100_000_000, 'camera', image)
     # Before what the new time says is broadcast.
     assert forgotten == [0, 1]
@@ -123,11 +123,11 @@ def test_a_shutdown_that_fails_says_so_and_forgets_everything_all_the_same(
         raise OSError('the disk is full')
 
     reports = pair.listen(DiagnosticArray, '/diagnostics')
-    monkeypatch.setattr(pair.node._keeper, 'save', full)
+    monkeypatch.setattr(pair.node._parts.keeper, 'save', full)
     pair.node.trigger_shutdown()
     pair.wait(lambda: reports
               and reports[-1].status[0].message == 'shutdown failed: OSError: the disk is full')
-    assert pair.node._outputs is None
+    assert pair.node._parts is None
     assert 'shutdown done' not in capfd.readouterr().err
 
 
