@@ -22,11 +22,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.judge import Found
 from nccs_pose.estimation.ledger import Ledger
 from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -54,14 +54,14 @@ def _strips(
 
 
 def _ledger(
-    symmetries: tuple[Pose2, ...], told: Told | None, left: Sequence[FittedCandidate],
+    symmetries: tuple[Pose2, ...], gate: Gate | None, left: Sequence[FittedCandidate],
     others: Sequence[Pose2] = (),
 ) -> Ledger:
-    return Ledger(symmetries, told, RATIO, left, Poses.of(others))
+    return Ledger(symmetries, gate, RATIO, left, Poses.of(others))
 
 
-def _told(pose: Pose2) -> Told:
-    return Told(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
+def _gate(pose: Pose2) -> Gate:
+    return Gate(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
 
 
 def _are(poses: Sequence[Pose2], expected: Sequence[Pose2]) -> bool:
@@ -84,15 +84,15 @@ def test_a_pose_is_known_with_its_twins() -> None:
 def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
     twin = HALF_TURN @ HERE
     assert _ledger((HALF_TURN,), None, ()).hold(_found(HERE, 0.9), None) == []
-    ledger = _ledger((HALF_TURN,), _told(twin), ())
+    ledger = _ledger((HALF_TURN,), _gate(twin), ())
     assert ledger.hold(_found(HERE, 0.9), None) == [twin]
     assert not ledger.knows(twin)
     assert ledger.closed().open == []
 
 
 def test_what_holds_leaves_its_twins_open() -> None:
-    for told in (None, _told(HERE)):
-        ledger = _ledger((HALF_TURN,), told, ())
+    for gate in (None, _gate(HERE)):
+        ledger = _ledger((HALF_TURN,), gate, ())
         ledger.hold(_found(HERE, 0.9), None)
         twin, = ledger.closed().open
         assert twin.pose == HALF_TURN @ HERE

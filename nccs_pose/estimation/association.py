@@ -28,12 +28,12 @@ from typing import NamedTuple
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_points import footprints, half_strip
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines, poses_of_pairs
 from nccs_pose.estimation.strip_scores import SeenMap, StripScorer
 from nccs_pose.estimation.symmetries import map_symmetries
-from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import as_points, Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -103,14 +103,14 @@ class Associator:
         self._last: StripScorer | None = None
 
     def candidates(
-        self, segments: tuple[FloorSegment, ...], told: Told | None = None,
+        self, segments: tuple[FloorSegment, ...], gate: Gate | None = None,
     ) -> Candidates:
         """Poses that explain strips; none where fewer than two strips cross.
 
         The best few are laid on the strips by least squares; where a map has many places alike
         the others follow as they were guessed, with what they score there.
 
-        :param told: where the robot is by something else; poses there are not left out for others
+        :param gate: where the robot is by something else; poses inside are not left out for others
             that explain as much.
         """
         if len(segments) < 2:
@@ -122,7 +122,7 @@ class Associator:
         guessed: list[FittedCandidate] = []
         others = _NONE
         if len(poses.place) > _REFINED:
-            poses, guessed, others = _promising(scorer, poses, told)
+            poses, guessed, others = _promising(scorer, poses, gate)
             poses, claimed, misfit = scorer.refined(poses, 1)
         else:
             poses, claimed, misfit = scorer.refined(poses, 2)
@@ -199,15 +199,15 @@ def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
 
 
 def _promising(
-    scorer: StripScorer, poses: Poses, told: Told | None,
+    scorer: StripScorer, poses: Poses, gate: Gate | None,
 ) -> tuple[Poses, list[FittedCandidate], Poses]:
     """Of many poses those that are worth refining, and others that show as much.
 
     :returns: those, others that were looked at, and others that leave no strip unexplained.
     """
     claimed = scorer.claimed(poses, _COARSE)
-    there = np.zeros(len(claimed), dtype=bool) if told is None else (
-        told.holds_guesses(poses.place, poses.rotation))
+    there = np.zeros(len(claimed), dtype=bool) if gate is None else (
+        gate.contains_each(poses))
     best = np.lexsort([-claimed, ~there])
     if len(best) > _CLOSE:
         best = one_of_each(poses, best)

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 
 from nccs_pose.estimation.aligner import LINEAR_PX
 from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
@@ -80,7 +80,7 @@ class Case:
     :ivar sight: what the look shows.
     :ivar history: what images have said of the lines before.
     :ivar prediction: of the pose, if there is one.
-    :ivar told: where the robot is by something else than the image, which can decide between
+    :ivar gate: where the robot is by something else than the image, which can decide between
         equal poses: those that are there come first. Without it two equal poses are enough to
         know that the image does not decide, and no more are laid on it.
     :ivar before: what came of other looks at the same image.
@@ -89,7 +89,7 @@ class Case:
     sight: Sight
     history: LineHistory
     prediction: Prediction | None
-    told: Told | None
+    gate: Gate | None
     before: Mapping[Sight, Sifted]
 
     @property

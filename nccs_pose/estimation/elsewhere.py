@@ -22,6 +22,7 @@ from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.association import Candidates
 from nccs_pose.estimation.case import SEARCH_BAND
+from nccs_pose.estimation.gate import BETTER, Gate
 from nccs_pose.estimation.judge import fit_of
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
@@ -29,7 +30,6 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import COINCIDENT
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
-from nccs_pose.estimation.told import BETTER, Told
 from nccs_pose.estimation.verdict import contradiction, is_suspect, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -92,15 +92,15 @@ class Elsewhere:
         here, _ = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
             return None
-        gate = min(_GATE, self._options.innovation_gate)
-        told = Told(prediction.pose, prediction.covariance, gate)
-        found = self._searcher.candidates(segments, told if vague else None)
+        sigmas = min(_GATE, self._options.innovation_gate)
+        gate = Gate(prediction.pose, prediction.covariance, sigmas)
+        found = self._searcher.candidates(segments, gate if vague else None)
         best = found.fitted[0] if found.fitted else None
         if best is not None and best.score > here + BETTER and not same_pose(
                 best.pose, alignment.pose):
             return Refused(_ANOTHER, alignment)
-        if vague and (self._shows_as_much(found, alignment, here, told)
-                      or self._is_one_of_parallels(image, alignment, prediction, told)):
+        if vague and (self._shows_as_much(found, alignment, here, gate)
+                      or self._is_one_of_parallels(image, alignment, prediction, gate)):
             # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
@@ -120,19 +120,19 @@ class Elsewhere:
         return False
 
     def _shows_as_much(
-        self, found: Candidates, alignment: Alignment, here: float, told: Told,
+        self, found: Candidates, alignment: Alignment, here: float, gate: Gate,
     ) -> bool:
-        """Whether strips show as much of another pose where it is told."""
+        """Whether strips show as much of another pose inside the gate."""
         least = self._options.ambiguity_ratio * here
         others = found.others[unlike(found.others, Poses.of([alignment.pose]))]
-        return bool(told.holds_guesses(others.place, others.rotation).any()) or any(
-            c.score >= least and told.holds(c.pose) and not same_pose(c.pose, alignment.pose)
+        return bool(gate.contains_each(others).any()) or any(
+            c.score >= least and gate.contains(c.pose) and not same_pose(c.pose, alignment.pose)
             for c in found.fitted)
 
     def _is_one_of_parallels(
-        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction, told: Told,
+        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction, gate: Gate,
     ) -> bool:
-        """Whether a pose on parallel lines alone lies as well on others where it is told.
+        """Whether a pose on parallel lines alone lies as well on others inside the gate.
 
         These fix no pose, so that no search of the whole image finds them.
         """
@@ -141,7 +141,7 @@ class Elsewhere:
         least = self._options.ambiguity_ratio * alignment.explained
         places = (Pose2(alignment.pose.x + x, alignment.pose.y + y, alignment.pose.yaw)
                   for x, y in self._steps_across(alignment.lines[0]).tolist())
-        for pose in islice(filter(told.holds, places), _TRIED):
+        for pose in islice(filter(gate.contains, places), _TRIED):
             other = self._aligner.align(
                 image, pose, alignment.colours, reach=self._options.band,
                 prior=(pose, prediction.information))

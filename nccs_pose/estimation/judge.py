@@ -236,11 +236,11 @@ def explains_nearly_all(found: Found) -> bool:
             and min(found.claimed, found.alignment.explained) >= _NEARLY_ALL)
 
 
-def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float) -> bool:
+def is_expected(alignment: Alignment, prediction: Prediction | None, sigmas: float) -> bool:
     """Whether a pose is where a prediction says, within so many deviations."""
     if prediction is None:
         return False
     if is_weak(alignment):
-        gate = min(gate, _WEAK_GATE)
+        sigmas = min(sigmas, _WEAK_GATE)
     return close(
-        alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
+        alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, sigmas)

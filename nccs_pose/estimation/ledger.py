@@ -23,9 +23,9 @@ import math
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -78,13 +78,13 @@ class Ledger:
     """
 
     def __init__(
-        self, symmetries: Sequence[Pose2], told: Told | None, ratio: float,
+        self, symmetries: Sequence[Pose2], gate: Gate | None, ratio: float,
         left: Iterable[FittedCandidate], others: Poses,
     ) -> None:
         """Begin.
 
         :param symmetries: motions of the map that change nothing, without the identity.
-        :param told: where the robot is by something else than the image; without it nothing is
+        :param gate: where the robot is by something else than the image; without it nothing is
             learned of a twin by laying it on the image too.
         :param ratio: a pose that scores this part of the best is its equal.
         :param left: candidates that are not to be laid on the image.
@@ -95,7 +95,7 @@ class Ledger:
         # How the best moved from where its strips put it, in base_link.
         self._moved = Pose2(0.0, 0.0, 0.0)
         self._symmetries = symmetries
-        self._told = told
+        self._gate = gate
         self._ratio = ratio
         # Poses that lie on the image, whatever it says of them.
         self._laid: list[Pose2] = []
@@ -181,8 +181,8 @@ class Ledger:
             self.best = found
             self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if strips is None else (
                 strips.misfit, strips.pose.inverse() @ found.alignment.pose)
-        twins, told = self._twins(found.alignment.pose), self._told
-        there = [told is not None and told.holds(twin) for twin in twins]
+        twins, gate = self._twins(found.alignment.pose), self._gate
+        there = [gate is not None and gate.contains(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
         return [twin for twin, near in zip(twins, there) if near]
 
@@ -201,7 +201,7 @@ class Ledger:
         """Note a pose that would hold, if something hid the lines that it misses."""
         pose = shown.alignment.pose
         self._note(against, shown.alignment)
-        alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
+        alike = (pose, *self._twins(pose)) if self._gate is None else (pose,)
         self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
         self._excused.append(shown)
 
@@ -236,7 +236,7 @@ class Ledger:
         return [s @ pose for s in self._symmetries]
 
     def _settle_twins(self, pose: Pose2) -> None:
-        if self._told is None:
+        if self._gate is None:
             self._settled += self._twins(pose)
 
     def _open(self, known: list[Pose2], best: Found) -> list[Candidate]:

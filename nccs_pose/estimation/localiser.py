@@ -39,6 +39,7 @@ from nccs_pose.estimation.elsewhere import FITS_ELSEWHERE
 from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.frame import Frame
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.given_pose import GivenPose
 from nccs_pose.estimation.hypotheses import ambiguity, Hypothesis, LEAST_IMAGES, OpenPoses
 from nccs_pose.estimation.judge import Found, Judge
@@ -55,7 +56,6 @@ from nccs_pose.estimation.sifting import Sifter
 from nccs_pose.estimation.sights import Sight, sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.symmetries import map_symmetries
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import what_is_missing
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -227,9 +227,9 @@ class Localiser:
             frame = replace(frame, prediction=None)
         given = None if self._given is None else self._given.expected(
             frame.stamp_ns, frame.wheels)
-        told = self._told(given or frame.prediction)
+        gate = self._gate_of(given or frame.prediction)
         hypotheses = self._open.at(frame.stamp_ns, frame.wheels)
-        looks, last = self._looks(frame, told, hypotheses)
+        looks, last = self._looks(frame, gate, hypotheses)
         sifted = looks[last]
         held = sifted.held
         self._in_vain = 0 if held else self._in_vain + 1
@@ -246,15 +246,15 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(frame, last, refused)
-        chosen = the_one_expected(held, sifted, told, frame.prediction, self._options)
+        chosen = the_one_expected(held, sifted, gate, frame.prediction, self._options)
         if chosen is not None:
             words = _FOUND if len(held) == 1 else (
                 'several poses explain the image; the one expected was taken')
             return self._tracking(frame, chosen, words, held=held)
-        return self._decided(frame, held, sifted, told, hypotheses, is_first)
+        return self._decided(frame, held, sifted, gate, hypotheses, is_first)
 
     def _decided(
-        self, frame: Frame, held: list[Found], sifted: Sifted, told: Told | None,
+        self, frame: Frame, held: list[Found], sifted: Sifted, gate: Gate | None,
         before: Sequence[Hypothesis], is_first: bool,
     ) -> Estimate:
         """Decide between poses by all images since they were first seen, or leave them open.
@@ -271,7 +271,7 @@ class Localiser:
                 is_first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(frame, found, _FOUND, held=held)
-        if told is not None and not may_show(told, held, sifted):
+        if gate is not None and not may_show(gate, held, sifted):
             # Carried on for long, what was expected would agree with one of them by chance.
             if self._refuted_ns is None:
                 self._refuted_ns = frame.stamp_ns
@@ -280,7 +280,7 @@ class Localiser:
         return answers.undecided(frame, held[0], hypotheses, more, self._options, self._unknown)
 
     def _looks(
-        self, frame: Frame, told: Told | None, hypotheses: tuple[Hypothesis, ...],
+        self, frame: Frame, gate: Gate | None, hypotheses: tuple[Hypothesis, ...],
     ) -> tuple[dict[Sight, Sifted], Sight]:
         """Look at an image in one way after the other, until one shows a pose.
 
@@ -288,11 +288,11 @@ class Localiser:
         """
         looks: dict[Sight, Sifted] = {}
         for sight in sights(frame.image, self._searcher, self._fresh_colours(), self._in_vain,
-                            told, frame.watch.lap):
+                            gate, frame.watch.lap):
             # One that comes again would come to the same.
             if sight not in looks:
                 looks[sight] = self._sifter.sift(
-                    Case(sight, self._history, frame.prediction, told, looks), hypotheses)
+                    Case(sight, self._history, frame.prediction, gate, looks), hypotheses)
             sifted = looks[sight]
             frame.watch.lap('measure')
             # On a sight that came early, though it promises little, one pose alone proves nothing.
@@ -301,13 +301,13 @@ class Localiser:
                 break
         return looks, sight
 
-    def _told(self, expected: Prediction | None) -> Told | None:
-        """Where a pose that was given, or the prediction, says that the robot is."""
+    def _gate_of(self, expected: Prediction | None) -> Gate | None:
+        """The gate about a pose that was given, or about the prediction."""
         if expected is None:
             return None
         if expected.is_given:
-            return Told(expected.pose, expected.carried, _PRIOR_GATE)
-        return Told(expected.pose, expected.covariance, self._options.innovation_gate)
+            return Gate(expected.pose, expected.carried, _PRIOR_GATE)
+        return Gate(expected.pose, expected.covariance, self._options.innovation_gate)
 
     def _trusted(self, frame: Frame, given: Prediction, sight: Sight) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""

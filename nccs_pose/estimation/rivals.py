@@ -95,7 +95,7 @@ class Rivals:
             min(found.claimed, alignment.explained) > _PLAINLY_ALL)
         if alignment.missing and not (plain or sharp):
             return _INCOMPLETE
-        if case.told is None and self.are_many(found, candidates):
+        if case.gate is None and self.are_many(found, candidates):
             return None
         if few and not sharp:
             return _TWO_COARSE

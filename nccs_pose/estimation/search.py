@@ -22,9 +22,9 @@ import math
 from nccs_pose.estimation.association import Associator, Candidates, FittedCandidate
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment, widest_gap
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.strip_pairs import BEYOND
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -177,9 +177,9 @@ class Searcher:
                 blobs, self._floor, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(self, segments: Strips, told: Told | None = None) -> Candidates:
-        """Poses that explain the strips; of too many those where it is told."""
-        return self._associator.candidates(segments, told)
+    def candidates(self, segments: Strips, gate: Gate | None = None) -> Candidates:
+        """Poses that explain the strips; of too many those inside the gate."""
+        return self._associator.candidates(segments, gate)
 
     def taken_for(self, pose: Pose2, segments: Strips) -> list[FittedCandidate]:
         """What a pose may be taken for in a coarse image."""

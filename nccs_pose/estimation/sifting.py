@@ -31,8 +31,8 @@ from nccs_pose.estimation.rivals import DOUBTS, Rivals
 from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 
-# Where nothing is told of the pose, the search of an image ends after so many candidates that do
-# not hold: in all of seven hundred first images that showed a pose it was one of these.
+# Without a gate the search of an image ends after so many candidates that do not hold: in all of
+# seven hundred first images that showed a pose it was one of these.
 _IN_VAIN = 4
 # Only candidates that score this fraction of the best, or are where the robot should be, are laid
 # on the image: one that holds is the best by strips or nearly so (a thousand that held had 0.93 of
@@ -59,16 +59,16 @@ class Sifter:
 
     def sift(self, case: Case, hypotheses: Sequence[Hypothesis]) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image."""
-        candidates, told = case.sight.candidates, case.told
-        if told is not None and len(candidates) > TRIED:
-            candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
+        candidates, gate = case.sight.candidates, case.gate
+        if gate is not None and len(candidates) > TRIED:
+            candidates = tuple(sorted(candidates, key=lambda c: not gate.contains(c.pose)))
         ledger = Ledger(
-            self._symmetries, told, self._options.ambiguity_ratio, candidates[TRIED:],
+            self._symmetries, gate, self._options.ambiguity_ratio, candidates[TRIED:],
             case.sight.others)
         starts = deque(Start(h.pose, self._options.band) for h in hypotheses)
         for c in candidates[:TRIED]:
             if c.score >= _WORTH_TRYING * case.sight.promise or (
-                    told is not None and told.holds(c.pose)):
+                    gate is not None and gate.contains(c.pose)):
                 starts.append(Start.of(c))
             else:
                 ledger.pass_over(c)
@@ -80,7 +80,7 @@ class Sifter:
             if start.strips is not None and ledger.beats(start.strips):
                 ledger.pass_over(start.strips)
                 continue
-            if undecided or (in_vain >= _IN_VAIN and told is None):
+            if undecided or (in_vain >= _IN_VAIN and gate is None):
                 # What the image shows of the hypotheses is among the candidates.
                 if start.strips is not None:
                     ledger.leave(start.strips)
@@ -127,7 +127,7 @@ class Sifter:
     def _is_undecided(self, case: Case, ledger: Ledger) -> bool:
         """Whether an image decides nothing between poses that hold, nor does anything else."""
         best = ledger.best
-        return best is not None and case.told is None and (
+        return best is not None and case.gate is None and (
             ledger.is_tied() or self._rivals.are_many(best, case.sight.candidates))
 
     def _verdict(

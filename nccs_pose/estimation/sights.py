@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import AS_MUCH
 from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.told import Told
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +84,7 @@ class Sight:
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
-    told: Told | None, lap: Callable[[str], None],
+    gate: Gate | None, lap: Callable[[str], None],
 ) -> Iterator[Sight]:
     """Look at an image in one way after the other, for sights on which poses are worth a try.
 
@@ -98,7 +98,7 @@ def sights(
     :param colours: what tapes look like to begin with.
     :param in_vain: how many images before this one were searched and showed nothing; from one to
         the next the groups of further looks take turns.
-    :param told: where the robot is by something else than the image.
+    :param gate: where the robot is by something else than the image.
     :param lap: is told the name of each stage that ends.
     """
     groups = searcher.further
@@ -111,7 +111,7 @@ def sights(
         if best is not None and segments is best.segments:
             continue
         lap('detect')
-        sight = Sight(image, segments, *searcher.candidates(segments, told), shown)
+        sight = Sight(image, segments, *searcher.candidates(segments, gate), shown)
         lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
