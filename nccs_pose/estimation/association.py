@@ -53,7 +53,7 @@ _ASKEW = 0.15
 _MUCH = 0.85
 # A pose that explains this part of the strips leaves none unexplained.
 ALL_STRIPS = 0.95
-_NONE = Poses(np.zeros(0, complex), np.zeros(0, complex))
+_NONE = Poses.of(())
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,12 @@ class Associator:
         if len(segments) < 2:
             return Candidates((), _NONE)
         scorer = self._scorer(segments)
-        poses = Poses(*poses_of_pairs(scorer.strips, self._joined, _PAIRS))
-        if len(poses.place) == 0:
+        poses = poses_of_pairs(scorer.strips, self._joined, _PAIRS)
+        if not len(poses):
             return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []
         others = _NONE
-        if len(poses.place) > _REFINED:
+        if len(poses) > _REFINED:
             poses, guessed, others = _promising(scorer, poses, gate)
             poses, claimed, misfit = scorer.refined(poses, 1)
         else:
@@ -141,7 +141,7 @@ class Associator:
             return []
         scorer = self._scorer(segments)
         places = Poses.of([likeness @ pose for likeness in self._likenesses])
-        return [*_fitted(scorer, places, scorer.claimed(places), np.zeros(len(places.place))),
+        return [*_fitted(scorer, places, scorer.claimed(places), np.zeros(len(places))),
                 *_fitted(scorer, *scorer.refined(places, 2))]
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
@@ -190,8 +190,8 @@ def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
         np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
         line.length, _ASKEW, np.zeros((0, 2)), line.colour) for line in line_map)
     scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), seen)
-    poses = Poses(*poses_of_pairs(scorer.strips, seen.lines, _PAIRS))
-    if not 0 < len(poses.place) <= _CLOSE:
+    poses = poses_of_pairs(scorer.strips, seen.lines, _PAIRS)
+    if not 0 < len(poses) <= _CLOSE:
         return ()
     poses, claimed, _ = scorer.refined(poses, 4)
     poses = poses[[k for k in distinct(poses, claimed) if claimed[k] > _MUCH]]

@@ -94,7 +94,7 @@ def left_open(
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
     more = [h.candidate for h in others[most:]]
     more += [Candidate(c.pose, before * c.score) for c in (*sifted.open[most:], *sifted.rest)]
-    if len(sifted.others.place) > 0:
+    if len(sifted.others):
         # They show no more than the least of what was looked at closely, for all that is known.
         least = min([*(h.mean for h in (best, *others)), *(c.score for c in more)])
         more += [Candidate(pose, least) for pose in sifted.others.listed()]

@@ -226,7 +226,7 @@ class Ledger:
         rest = self._unlaid(
             [c for c in less if c.claimed > best.claimed - AS_MUCH], known, best)
         others = self._others
-        if len(others.place) > 0:
+        if len(others):
             others = others[unlike(others, known)]
         return Sifted(
             held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest,

@@ -43,6 +43,9 @@ class Poses:
         x, y, yaw = np.array([(pose.x, pose.y, pose.yaw) for pose in poses]).reshape(-1, 3).T
         return cls(np.exp(1j * yaw), x + 1j * y)
 
+    def __len__(self) -> int:
+        return len(self.place)
+
     def __getitem__(
         self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int] | slice,
     ) -> Poses:
