@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lays poses on images and says which of them hold, and why the others do not."""
+"""Which poses that were laid on an image hold, and why the others do not: what all of it says."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.verdict import (
     contradiction,
     is_weak,
+    line_name,
     lines_used,
     Objection,
     objection,
@@ -108,15 +109,21 @@ class Judge:
         :param history: what images have said of the lines before.
         :param expected: whether a prediction agrees with the pose.
         """
-        found = objection(alignment, self._map, self._options, expected=expected)
+        return objection(
+            alignment, self._map, self._options, expected=expected,
+        ) or self._objection_of_places(image, alignment, history, expected)
+
+    def _objection_of_places(
+        self, image: NDArray[np.uint8], alignment: Alignment, history: LineHistory, expected: bool,
+    ) -> Objection | None:
+        """What lines say that leave a question, looked for in their places and beside them."""
         # Out of nothing every line in view is looked at, else those that leave a question.
         least = WEAK if expected else np.inf
         support = alignment.support.tolist()
         asked = {*(k for k, part in enumerate(support) if part < least),
                  *(k for k in history.doubted if support[k] >= 0.0)}
-        if found is not None or not asked:
-            return found
-        asked -= plainly_in_place(alignment) | history.unasked(alignment)
+        if asked:
+            asked -= plainly_in_place(alignment) | history.unasked(alignment)
         if not asked:
             return None
         colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
@@ -125,17 +132,18 @@ class Judge:
         bands, slide = self._predictor.bands(places, alignment.pose)
         moved = slide[:, 3:] @ alignment.refinement.attitude
         for k in sorted(asked):
-            line, own = self._map[k], bands.label == k
+            own = bands.label == k
             seen = placement(
-                image, k, bands[own], moved[own], colours[line.colour], self._options.band,
-                alignment, self._map, self._table)
-            name = line.name or f'number {k}'
+                image, k, bands[own], moved[own], colours[self._map[k].colour],
+                self._options.band, alignment, self._map, self._table)
             if seen.beside is not None:
                 return Objection(
-                    f'line {name} is seen {seen.beside:.1f} px beside its place', line=k)
+                    f'{line_name(self._map, k)} is seen {seen.beside:.1f} px beside its place',
+                    line=k)
             others = lines_used(alignment) - (alignment.support[k] >= WEAK)
             if k in history.doubted and not seen.confirmed and others < BEYOND_DOUBT:
-                return Objection(f'line {name} was seen beside its place, and not in it since')
+                return Objection(
+                    f'{line_name(self._map, k)} was seen beside its place, and not in it since')
         return None
 
     def found(

@@ -41,7 +41,7 @@ _WORTH_TRYING = 0.75
 
 
 class Sifter:
-    """Lays poses on images of one rig and map."""
+    """Finds the poses that hold on images of one rig and map."""
 
     def __init__(
         self, aligner: Aligner, judge: Judge, rivals: Rivals, symmetries: tuple[Pose2, ...],
