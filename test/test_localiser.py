@@ -565,7 +565,7 @@ def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatc
     # Nor would any line that should be seen there.
     judge = Judge(
         Searcher(table, RAILS, options), aligner.predictor, table, RAILS, options)
-    against = judge.found(image, alignment, (), LineHistory(), expected=False, strips=None)
+    against = judge.found(image, alignment, (), LineHistory(), expected=False, candidate=None)
     assert isinstance(against, Objection) and not judge.may_miss(alignment, against)
     seen = replace(alignment, support=np.array([1.0, 1.0, 0.0, np.nan]))
     assert judge.may_miss(seen, against)

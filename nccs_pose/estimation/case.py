@@ -41,12 +41,12 @@ class Start:
     """A pose to lay on an image.
 
     :ivar reach: how far it may be off in the image, px.
-    :ivar strips: what they say of it; None if it has to be tried in any case.
+    :ivar candidate: what the strips say of it; None if it has to be tried in any case.
     """
 
     pose: Pose2
     reach: float
-    strips: FittedCandidate | None = None
+    candidate: FittedCandidate | None = None
 
     @classmethod
     def of(cls, candidate: FittedCandidate) -> Start:
@@ -56,7 +56,7 @@ class Start:
     @property
     def misfit(self) -> float:
         """How far the strips lie off its lines, px."""
-        return 0.0 if self.strips is None else self.strips.misfit
+        return 0.0 if self.candidate is None else self.candidate.misfit
 
     @property
     def reaches(self) -> tuple[float, ...]:
@@ -65,7 +65,7 @@ class Start:
 
     def kept(self, pose: Pose2) -> FittedCandidate | None:
         """What the strips say of the pose that it became on the image; None where that is new."""
-        return self.strips if self.is_at(pose) else None
+        return self.candidate if self.is_at(pose) else None
 
     def is_at(self, pose: Pose2) -> bool:
         """Whether the strips lie on a pose as they do on this."""

@@ -149,17 +149,17 @@ class Judge:
     def found(
         self, image: NDArray[np.uint8], alignment: Alignment,
         segments: tuple[FloorSegment, ...], history: LineHistory, *, expected: bool,
-        strips: FittedCandidate | None,
+        candidate: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose by the whole image.
 
-        :param strips: what these say of it, if that is known.
+        :param candidate: what the strips say of it, if that is known.
         """
         # What no lines hold in its place tells nothing of where other lines are.
         if leaves_open(alignment.refinement):
             return _UNFIXED
         return self.objection(image, alignment, history, expected=expected) or self.by_strips(
-            alignment, segments, expected=expected, strips=strips)
+            alignment, segments, expected=expected, candidate=candidate)
 
     def may_miss(self, alignment: Alignment, against: Objection) -> bool:
         """Whether lines that a refused pose misses may be near their places.
@@ -173,13 +173,13 @@ class Judge:
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
-        strips: FittedCandidate | None,
+        candidate: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose against which the image itself says nothing; see :meth:`found`."""
         against = contradiction(alignment, segments, self._map)
         if against is not None:
             return against
-        found = self.measured(alignment, segments, strips)
+        found = self.measured(alignment, segments, candidate)
         if found.score <= 0.0:
             return _NOTHING
         used = lines_used(alignment)
@@ -198,23 +198,23 @@ class Judge:
         return found
 
     def beforehand(
-        self, strips: FittedCandidate, lines_in_view: Callable[[Pose2], int],
+        self, candidate: FittedCandidate, lines_in_view: Callable[[Pose2], int],
     ) -> Objection | None:
         """What strips alone say against a pose that nothing expects; None if nothing.
 
         :param lines_in_view: how many lines should be seen from a pose.
         """
-        if strips.claimed >= _MOST:
+        if candidate.claimed >= _MOST:
             return None
-        seen = lines_in_view(strips.pose)
+        seen = lines_in_view(candidate.pose)
         return _unexplained(seen) if seen < 3 else None
 
     def measured(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...],
-        strips: FittedCandidate | None = None,
+        candidate: FittedCandidate | None = None,
     ) -> Found:
         """How much a pose explains, whether it holds or not; see :meth:`found`."""
-        score, claimed = (strips.score, strips.claimed) if strips is not None else (
+        score, claimed = (candidate.score, candidate.claimed) if candidate is not None else (
             self._searcher.score(alignment.pose, segments))
         return Found(
             alignment, claimed, shown(score, alignment) * fit_of(alignment.points.variance),

@@ -134,7 +134,7 @@ class Ledger:
         return self.best is not None and len(
             [f for f in self._held if f.score >= self._ratio * self.best.score]) > 1
 
-    def beats(self, strips: FittedCandidate) -> bool:
+    def beats(self, candidate: FittedCandidate) -> bool:
         """Whether a pose, by what strips show of it, has no chance against the best that holds.
 
         On the image no pose scores more than the square root of what it scores by strips, times
@@ -145,33 +145,33 @@ class Ledger:
         best, ratio = self.best, self._ratio
         if best is None:
             return False
-        if explains_nearly_all(best) and strips.score < ratio * best.by_strips and (
-                strips.claimed < ALL_STRIPS):
+        if explains_nearly_all(best) and candidate.score < ratio * best.by_strips and (
+                candidate.claimed < ALL_STRIPS):
             return True
-        excess = max(strips.misfit**2 - self._best_misfit**2, 0.0)
-        return math.sqrt(strips.score) * fit_of(excess) < ratio * best.score
+        excess = max(candidate.misfit**2 - self._best_misfit**2, 0.0)
+        return math.sqrt(candidate.score) * fit_of(excess) < ratio * best.score
 
-    def leave(self, strips: FittedCandidate) -> None:
+    def leave(self, candidate: FittedCandidate) -> None:
         """Leave a candidate that was not laid on the image."""
-        self._left.append(strips)
+        self._left.append(candidate)
 
-    def pass_over(self, strips: FittedCandidate) -> None:
+    def pass_over(self, candidate: FittedCandidate) -> None:
         """Leave a candidate that is no rival of the best pose that holds."""
-        self._passed_over.append(strips)
+        self._passed_over.append(candidate)
 
-    def rule_out(self, strips: FittedCandidate, against: Objection) -> None:
+    def rule_out(self, candidate: FittedCandidate, against: Objection) -> None:
         """Refuse a candidate by its strips alone, unless something is hidden."""
         self._refused.append(Refused(against))
-        self._hidden.append(Candidate(strips.pose, strips.score))
+        self._hidden.append(Candidate(candidate.pose, candidate.score))
 
     def begin(self, pose: Pose2) -> None:
         """Note where a pose starts from; from a twin of that it would come to a twin of itself."""
         self._settle_twins(pose)
 
-    def hold(self, found: Found, strips: FittedCandidate | None) -> list[Pose2]:
+    def hold(self, found: Found, candidate: FittedCandidate | None) -> list[Pose2]:
         """Note a pose that holds.
 
-        :param strips: what these say of the pose that it started from; None if nothing.
+        :param candidate: what the strips say of the pose that it started from; None if nothing.
         :returns: those of its twins that have to be laid on the image too.
         """
         self._laid.append(found.alignment.pose)
@@ -179,8 +179,8 @@ class Ledger:
         self._held.append(found)
         if self.best is None or found.score > self.best.score:
             self.best = found
-            self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if strips is None else (
-                strips.misfit, strips.pose.inverse() @ found.alignment.pose)
+            self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if candidate is None else (
+                candidate.misfit, candidate.pose.inverse() @ found.alignment.pose)
         twins, gate = self._twins(found.alignment.pose), self._gate
         there = [gate is not None and gate.contains(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
@@ -268,11 +268,11 @@ class Ledger:
         """Candidates that were not laid on the image, nor their likes."""
         if not left:
             return []
-        poses = Poses.of([strips.pose for strips in left])
+        poses = Poses.of([candidate.pose for candidate in left])
         # They differ among themselves.
         new = unlike(poses, known)
         score = np.minimum(
-            np.array([strips.score for strips in left]) / best.by_strips, 1.0) * best.score
+            np.array([candidate.score for candidate in left]) / best.by_strips, 1.0) * best.score
         # Strips that lie askew do so at all places where they look the same.
         moved = poses[new].and_on_by(self._moved)
         return [Candidate(*of) for of in zip(moved.listed(), score[new].tolist())]

@@ -77,23 +77,23 @@ class Sifter:
             start = starts.popleft()
             if ledger.knows(start.pose):
                 continue
-            if start.strips is not None and ledger.beats(start.strips):
-                ledger.pass_over(start.strips)
+            if start.candidate is not None and ledger.beats(start.candidate):
+                ledger.pass_over(start.candidate)
                 continue
             if undecided or (in_vain >= _IN_VAIN and gate is None):
                 # What the image shows of the hypotheses is among the candidates.
-                if start.strips is not None:
-                    ledger.leave(start.strips)
+                if start.candidate is not None:
+                    ledger.leave(start.candidate)
                 continue
             tried = self._tried(case, start, ledger)
             if isinstance(tried, Found):
                 starts += (Start(twin, SEARCH_BAND)
-                           for twin in ledger.hold(tried, start.strips))
+                           for twin in ledger.hold(tried, start.candidate))
                 undecided = self._is_undecided(case, ledger)
                 continue
             if tried is not None and not tried.is_sharp:
                 starts.extendleft(self._rivals.taken_for(case, tried))
-            if start.strips is not None and ledger.best is None:
+            if start.candidate is not None and ledger.best is None:
                 in_vain += 1
         return ledger.closed()
 
@@ -102,10 +102,10 @@ class Sifter:
 
         What came of one that does not hold is in the ledger.
         """
-        if case.prediction is None and start.strips is not None:
-            against = self._judge.beforehand(start.strips, self._aligner.lines_in_view)
+        if case.prediction is None and start.candidate is not None:
+            against = self._judge.beforehand(start.candidate, self._aligner.lines_in_view)
             if against is not None:
-                ledger.rule_out(start.strips, against)
+                ledger.rule_out(start.candidate, against)
                 return None
         verdict = self._again(case, start, ledger) or self._verdict(case, start, ledger)
         if verdict is None or verdict[1] not in DOUBTS:
@@ -151,7 +151,7 @@ class Sifter:
             expected = self._expected(case, alignment)
             found = self._unless_doubtful(case, ledger, self._judge.found(
                 sight.image, alignment, sight.segments, case.history, expected=expected,
-                strips=start.kept(alignment.pose)), expected)
+                candidate=start.kept(alignment.pose)), expected)
             verdict = alignment, found
             if isinstance(found, Found) or not self._judge.may_miss(alignment, found):
                 break
@@ -176,7 +176,7 @@ class Sifter:
             expected = self._expected(case, alignment)
             found = self._judge.by_strips(
                 alignment, case.sight.segments, expected=expected,
-                strips=start.kept(alignment.pose))
+                candidate=start.kept(alignment.pose))
             return alignment, self._unless_doubtful(case, ledger, found, expected)
         return None
 
