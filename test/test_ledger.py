@@ -76,7 +76,7 @@ def test_a_pose_is_known_with_its_twins() -> None:
     ledger.refuse(AWAY, _found(HERE, 0.5))
     assert ledger.knows(HERE) and ledger.was_laid(HERE)
     assert ledger.knows(HALF_TURN @ HERE) and not ledger.was_laid(HALF_TURN @ HERE)
-    ledger.begin(THERE)
+    ledger.settle_twins(THERE)
     assert ledger.knows(HALF_TURN @ THERE) and not ledger.knows(THERE)
     assert not ledger.knows(NOWHERE)
 

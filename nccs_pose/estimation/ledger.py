@@ -91,9 +91,8 @@ class Ledger:
         :param others: poses that leave no strip unexplained, besides the candidates.
         """
         self.best: Found | None = None
-        self._best_misfit = 0.0
-        # How the best moved from where its strips put it, in base_link.
-        self._moved = Pose2(0.0, 0.0, 0.0)
+        # What the strips say of the pose that the best started from; None if nothing.
+        self._best_candidate: FittedCandidate | None = None
         self._symmetries = symmetries
         self._gate = gate
         self._ratio = ratio
@@ -148,7 +147,8 @@ class Ledger:
         if explains_nearly_all(best) and candidate.score < ratio * best.by_strips and (
                 candidate.claimed < ALL_STRIPS):
             return True
-        excess = max(candidate.misfit**2 - self._best_misfit**2, 0.0)
+        misfit = 0.0 if self._best_candidate is None else self._best_candidate.misfit
+        excess = max(candidate.misfit**2 - misfit**2, 0.0)
         return math.sqrt(candidate.score) * fit_of(excess) < ratio * best.score
 
     def leave(self, candidate: FittedCandidate) -> None:
@@ -164,9 +164,13 @@ class Ledger:
         self._refused.append(Refused(against))
         self._hidden.append(Candidate(candidate.pose, candidate.score))
 
-    def begin(self, pose: Pose2) -> None:
-        """Note where a pose starts from; from a twin of that it would come to a twin of itself."""
-        self._settle_twins(pose)
+    def settle_twins(self, pose: Pose2) -> None:
+        """Note that nothing more would be learned of the twins of a pose that was tried.
+
+        Twins of where it starts would come to twins of where it ends.
+        """
+        if self._gate is None:
+            self._settled += self._twins(pose)
 
     def hold(self, found: Found, candidate: FittedCandidate | None) -> list[Pose2]:
         """Note a pose that holds.
@@ -175,12 +179,10 @@ class Ledger:
         :returns: those of its twins that have to be laid on the image too.
         """
         self._laid.append(found.alignment.pose)
-        self._settle_twins(found.alignment.pose)
+        self.settle_twins(found.alignment.pose)
         self._held.append(found)
         if self.best is None or found.score > self.best.score:
-            self.best = found
-            self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if candidate is None else (
-                candidate.misfit, candidate.pose.inverse() @ found.alignment.pose)
+            self.best, self._best_candidate = found, candidate
         twins, gate = self._twins(found.alignment.pose), self._gate
         there = [gate is not None and gate.contains(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
@@ -207,7 +209,7 @@ class Ledger:
 
     def _note(self, against: Objection, alignment: Alignment) -> None:
         self._laid.append(alignment.pose)
-        self._settle_twins(alignment.pose)
+        self.settle_twins(alignment.pose)
         self._refused.append(Refused(against, alignment))
 
     def closed(self) -> Sifted:
@@ -218,9 +220,21 @@ class Ledger:
         if not held:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
         best, poses = held[0], [f.alignment.pose for f in held]
-        left_open = self._open(poses, best)
-        known, least = Poses.of([*poses, *self._laid]), self._ratio * best.by_strips
-        left_open += self._unlaid([c for c in self._left if c.score >= least], known, best)
+        twins = self._equal_to_none(poses)
+        known = Poses.of([*poses, *twins, *self._laid])
+        least, least_shown = self._ratio * best.by_strips, self._ratio * best.shown
+        left_open = [
+            # One that explains nearly all, and more than the best does, leaves the best in doubt.
+            *(Candidate(f.alignment.pose, best.score) for f in self._excused
+              if explains_nearly_all(f) and f.score > best.score),
+            # How well lines lie says little on an image that leaves such doubts.
+            *(Candidate(f.alignment.pose, min(f.shown / best.shown, 1.0) * best.score)
+              for f in self._doubtful if f.shown >= least_shown),
+            # A twin shows what the pose that holds does, even if it was laid on it and refused.
+            *(Candidate(twin, best.score) for twin in twins),
+            *self._unlaid([c for c in self._left if c.score >= least], known, best)]
+        hidden = [*self._hidden, *(Candidate(f.alignment.pose, f.by_strips)
+                                   for f in self._doubtful if f.shown < least_shown)]
         # More of the lines of what explains the same strips may be there than they show.
         less = (*(c for c in self._left if c.score < least), *self._passed_over)
         rest = self._unlaid(
@@ -229,38 +243,18 @@ class Ledger:
         if len(others):
             others = others[unlike(others, known)]
         return Sifted(
-            held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest,
-            others)
+            held, hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest, others)
 
     def _twins(self, pose: Pose2) -> list[Pose2]:
         return [s @ pose for s in self._symmetries]
 
-    def _settle_twins(self, pose: Pose2) -> None:
-        if self._gate is None:
-            self._settled += self._twins(pose)
-
-    def _open(self, known: list[Pose2], best: Found) -> list[Candidate]:
-        """Poses that were laid on the image, or their twins, and are left open; hides others.
-
-        :param known: those that hold; what is left open is added.
-        """
-        # A pose that explains nearly all, and more than the best does, leaves the best in doubt.
-        found = [Candidate(excused.alignment.pose, best.score)
-                 for excused in self._excused
-                 if explains_nearly_all(excused) and excused.score > best.score]
-        for doubtful in self._doubtful:
-            pose = doubtful.alignment.pose
-            # How well its lines lie says little on an image that leaves such doubts.
-            if doubtful.shown >= self._ratio * best.shown:
-                found.append(Candidate(pose, min(doubtful.shown / best.shown, 1.0) * best.score))
-            else:
-                self._hidden.append(Candidate(pose, doubtful.by_strips))
-        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
+    def _equal_to_none(self, poses: list[Pose2]) -> list[Pose2]:
+        """Twins of what holds that are the same as none of some poses, nor as one another."""
+        new: list[Pose2] = []
         for twin in self._equal:
-            if not any(same_pose(twin, pose) for pose in known):
-                known.append(twin)
-                found.append(Candidate(twin, best.score))
-        return found
+            if not any(same_pose(twin, pose) for pose in (*poses, *new)):
+                new.append(twin)
+        return new
 
     def _unlaid(
         self, left: list[FittedCandidate], known: Poses, best: Found,
@@ -273,9 +267,12 @@ class Ledger:
         new = unlike(poses, known)
         score = np.minimum(
             np.array([candidate.score for candidate in left]) / best.by_strips, 1.0) * best.score
-        # Strips that lie askew do so at all places where they look the same.
-        moved = poses[new].and_on_by(self._moved)
-        return [Candidate(*of) for of in zip(moved.listed(), score[new].tolist())]
+        poses = poses[new]
+        if self.best is not None and self._best_candidate is not None:
+            # Strips that lie askew do so at all places where they look the same.
+            poses = poses.and_on_by(
+                self._best_candidate.pose.inverse() @ self.best.alignment.pose)
+        return [Candidate(*of) for of in zip(poses.listed(), score[new].tolist())]
 
 
 def _ranked(held: list[Found]) -> list[Found]:

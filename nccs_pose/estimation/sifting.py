@@ -109,7 +109,7 @@ class Sifter:
                 return None
         verdict = self._again(case, start, ledger) or self._verdict(case, start, ledger)
         if verdict is None or verdict[1] not in DOUBTS:
-            ledger.begin(start.pose)
+            ledger.settle_twins(start.pose)
         if verdict is None:
             return None
         alignment, found = verdict
