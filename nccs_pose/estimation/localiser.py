@@ -30,7 +30,7 @@ from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation import answers
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
-from nccs_pose.estimation.alignment import OPEN
+from nccs_pose.estimation.alignment import Alignment, OPEN
 from nccs_pose.estimation.case import Case
 from nccs_pose.estimation.coasting import may_coast, shows_another_place, shows_this_place
 from nccs_pose.estimation.course import Course
@@ -141,10 +141,9 @@ class Localiser:
         self._course = Course()
         self._given: GivenPose | None = None
         self._ever_tracked = False
-        # Whether an image has shown another place than expected since the last pose.
-        self._shaken = False
-        # Images in a row since then that agree with what was expected, but hide too much for one.
-        self._agreeing = 0
+        # How many images in a row have yet to agree with what is expected before the last pose is
+        # coasted on again: one since it has shown another place.
+        self._have_to_agree = 0
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -205,7 +204,7 @@ class Localiser:
             self._given = given
         watch = Stopwatch()
         wheels = self._odometry.at(stamp_ns)
-        prediction = self._course.at(stamp_ns, wheels, doubted=self._shaken)
+        prediction = self._course.at(stamp_ns, wheels, doubted=self._have_to_agree > 0)
         frame = Frame(stamp_ns, image, wheels, prediction, watch)
         watch.lap('predict')
         if prediction is None:
@@ -342,7 +341,7 @@ class Localiser:
         if prior is None:
             self._follower.begin()
         self._open, self._given, self._refuted_ns = OpenPoses(), None, None
-        self._shaken, self._agreeing, self._ever_tracked = False, 0, True
+        self._have_to_agree, self._ever_tracked = 0, True
         return answers.tracking(frame, reason, held or [found], found, covariance, unobserved)
 
     def _without_pose(self, frame: Frame, sight: Sight, refused: Refused) -> Estimate:
@@ -352,23 +351,32 @@ class Localiser:
         if against is not None and against.line is not None:
             contradicted = self._history.contradicts(against.line)
             self._history = self._history.doubting(against.line)
-        if prediction is not None:
-            self._shaken |= contradicted or bool(self._open) or shows_another_place(
-                sight, prediction, self._searcher)
-        if prediction is not None and self._shaken:
-            agrees = not (self._open or self._history.doubted) and shows_this_place(
-                sight, prediction, refused.alignment, self._searcher, self._options)
-            self._agreeing = self._agreeing + 1 if agrees else 0
-            self._shaken = self._agreeing < LEAST_IMAGES
         missing = what_is_missing(sight.segments) if against is None else against.words
         doubted = None if refused.alignment is None else Doubted(
             refused.alignment.pose, refused.alignment.points)
-        if prediction is not None and not self._shaken:
+        if prediction is not None:
+            self._weigh(sight, prediction, refused.alignment, contradicted=contradicted)
             seconds = self._course.seconds_to(frame.stamp_ns)
-            if may_coast(prediction, seconds, self._options):
+            if not self._have_to_agree and may_coast(prediction, seconds, self._options):
                 return answers.coasting(frame, prediction, seconds, missing, doubted)
         return answers.without_pose(
             frame, self._unknown, missing, self._open.at(frame.stamp_ns, frame.wheels), doubted)
+
+    def _weigh(
+        self, sight: Sight, prediction: Prediction, refused: Alignment | None, *,
+        contradicted: bool,
+    ) -> None:
+        """Note whether an image that gives no pose speaks for the expected place or against it.
+
+        :param refused: the pose that was laid on it and refused; None if none lies there.
+        :param contradicted: whether a line speaks against the poses before as well.
+        """
+        if contradicted or self._open or shows_another_place(sight, prediction, self._searcher):
+            self._have_to_agree = LEAST_IMAGES
+        elif self._have_to_agree:
+            agrees = not self._history.doubted and shows_this_place(
+                sight, prediction, refused, self._searcher, self._options)
+            self._have_to_agree = self._have_to_agree - 1 if agrees else LEAST_IMAGES
 
     @property
     def _unknown(self) -> State:
