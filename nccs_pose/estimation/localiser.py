@@ -224,7 +224,7 @@ class Localiser:
         if refused.objection is FITS_ELSEWHERE:
             # A pose is no longer believed for being expected.
             frame = replace(frame, prediction=None)
-        given = None if self._given is None else self._given.expected(
+        given = None if self._given is None else self._given.carried_on(
             frame.stamp_ns, frame.wheels)
         gate = self._gate_of(given or frame.prediction)
         hypotheses = self._open.at(frame.stamp_ns, frame.wheels)
