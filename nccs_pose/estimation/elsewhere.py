@@ -51,6 +51,15 @@ _ANOTHER = Objection('another pose explains the image better')
 _AS_WELL = Objection('another place where the robot may be by now explains the image as well')
 
 
+def leaves_room(alignment: Alignment, claimed: float) -> bool:
+    """Whether a pose leaves so much unexplained that another could explain more.
+
+    :param claimed: fraction of the line-coloured pixels that lie on its lines.
+    """
+    # No score exceeds 1.
+    return bool(alignment.missing) or min(claimed, alignment.explained) + BETTER < 1.0
+
+
 class Elsewhere:
     """Looks for other places, on one map, that an image shows."""
 
@@ -61,14 +70,6 @@ class Elsewhere:
         self._searcher = searcher
         self._map = line_map
         self._options = options
-
-    def leaves_room(self, alignment: Alignment, claimed: float) -> bool:
-        """Whether a pose leaves so much unexplained that another could explain more.
-
-        :param claimed: fraction of the line-coloured pixels that lie on its lines.
-        """
-        # No score exceeds 1.
-        return bool(alignment.missing) or min(claimed, alignment.explained) + BETTER < 1.0
 
     def refused(
         self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction,

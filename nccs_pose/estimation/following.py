@@ -17,7 +17,8 @@
 from __future__ import annotations
 
 from nccs_pose.estimation.aligner import Aligner
-from nccs_pose.estimation.elsewhere import Elsewhere
+from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.elsewhere import Elsewhere, leaves_room
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.line_history import LineHistory
@@ -60,6 +61,21 @@ class Follower:
         :param image: (H, W, 3) uint8 BGR.
         :param history: what images have said of the lines before.
         """
+        alignment = self._laid(image, prediction, colours, history, watch)
+        if isinstance(alignment, Refused):
+            return alignment
+        self._frames_since_check += 1
+        if (self._frames_since_check < self._options.check_every
+                and not (is_suspect(alignment) or prediction.is_vague or alignment.missing)
+                and len(alignment.lines) > 1):
+            return Found(alignment, float('nan'), alignment.explained)
+        return self._checked(image, alignment, prediction, watch)
+
+    def _laid(
+        self, image: NDArray[np.uint8], prediction: Prediction, colours: tuple[LineColour, ...],
+        history: LineHistory, watch: Stopwatch,
+    ) -> Alignment | Refused:
+        """Lay a predicted pose on an image: in its place or, if it does not hold, beside it."""
         prior = (prediction.pose, prediction.information)
         refused = Refused()
         for reach in (0.0, self._options.band):
@@ -71,20 +87,19 @@ class Follower:
                 continue
             against = self._judge.objection(image, alignment, history, expected=True)
             if against is None:
-                break
+                return alignment
             refused = Refused(against, alignment)
-        else:
-            return refused
-        self._frames_since_check += 1
-        due = self._frames_since_check >= self._options.check_every
-        suspect = is_suspect(alignment)
-        if not (due or suspect or prediction.is_vague or alignment.missing
-                or len(alignment.lines) == 1):
-            return Found(alignment, float('nan'), alignment.explained)
+        return refused
+
+    def _checked(
+        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction,
+        watch: Stopwatch,
+    ) -> Found | Refused:
+        """Hold a pose that lies on an image where it is expected against all of the image."""
         masks = self._searcher.masks(image)
         claimed = self._searcher.on_lines(alignment.pose, masks)
         watch.lap('detect')
-        if suspect or prediction.is_vague or self._elsewhere.leaves_room(alignment, claimed):
+        if is_suspect(alignment) or prediction.is_vague or leaves_room(alignment, claimed):
             segments = self._searcher.strips(masks)
             watch.lap('detect')
             elsewhere = self._elsewhere.refused(image, alignment, prediction, segments)
