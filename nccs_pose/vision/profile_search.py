@@ -20,7 +20,7 @@ import cv2
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.median import noise_deviation
 from nccs_pose.vision.profile_products import as_complex
 from nccs_pose.vision.profiles import FOUND, FOUND_FRACTION, ProfileFit
 import numpy as np
@@ -50,7 +50,7 @@ def search_profiles(
     best = pooled.argmax(axis=1)
     rows = np.arange(len(bands))
     # From station to station the tape stays and the noise does not.
-    noise = 1.4826 * upper_median(np.abs(contrast[1:] - contrast[:-1])) / np.sqrt(2.0 * together)
+    noise = noise_deviation(contrast[1:] - contrast[:-1]) / np.sqrt(2.0 * together)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0),
         pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION))

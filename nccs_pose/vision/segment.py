@@ -22,7 +22,7 @@ import cv2
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.colour import CONTRASTS
-from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.median import noise_deviation, upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,7 +106,7 @@ def raised_mask(
     around = cv2.max(cv2.blur(feature, (window, window)), cv2.min(opened, usual))
     # Of numbers shorter than 32 bits numpy finds the median in twice the time.
     some = feature[::4, ::4].astype(np.int32) - around[::4, ::4]
-    noise = 1.4826 * upper_median(np.abs(some - int(upper_median(some))))
+    noise = noise_deviation(some - int(upper_median(some)))
     threshold = max(2.0, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
