@@ -77,6 +77,9 @@ _MOST_PIXELS = 2000
 # The mean square distance from its middle is a third of the square of half of its width where a
 # strip is full, and more at a corner.
 _STRAIGHT = 0.5
+# A strip lies on a line of the map no further off than this, metres, beyond so many footprints.
+_ON = 0.06
+_ON_FOOTPRINTS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,11 @@ class FloorSegment:
     pixels: Array
     colour: str = 'green'
     pitch: int = 1
+
+    @property
+    def tolerance(self) -> float:
+        """How far off a line of the map it may be and still lies on it, metres."""
+        return _ON + _ON_FOOTPRINTS * self.footprint
 
 
 def floor_segments(

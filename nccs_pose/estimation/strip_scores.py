@@ -69,7 +69,7 @@ class StripScorer:
         self._points = (strips.start[:, None] + (
             strips.length * strips.direction)[:, None] * share).ravel()
         self._weight = np.repeat(weight / weight.sum() / _SAMPLES, _SAMPLES)
-        tolerance = 0.06 + 1.5 * footprint
+        tolerance = np.array([s.tolerance for s in segments])
         self._tolerance = np.repeat(tolerance, _SAMPLES)
         self._pixels_per_metre = np.repeat(pitch / np.maximum(footprint, 1e-9), _SAMPLES)
         self._layer = np.repeat(seen.nearest.layers(strips.colour), _SAMPLES)

@@ -32,8 +32,6 @@ _RESTS = 0.25
 # (m) is that line, moved.
 _PARALLEL = 0.12
 _NEAR = 0.6
-# A strip closer than this to a map line lies on it, metres beyond its own footprint.
-_ON = 0.06
 # A whole line lies off its place when its mean is this many standard deviations from zero; and by
 # more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
 _EVIDENT = 7.0
@@ -217,7 +215,7 @@ def _lie_on_map(
     x, y = line_map.directions[:, :2].T
     along = offset[..., 0] * x + offset[..., 1] * y
     across = np.abs(offset[..., 1] * x - offset[..., 0] * y).max(axis=1)
-    near = _ON + 1.5 * np.array([strip.footprint for strip in segments])
+    near = np.array([strip.tolerance for strip in segments])
     on = (across < near[:, None]) & (along.max(axis=1) > 0.0) & (
         along.min(axis=1) < line_map.lengths)
     return np.asarray(on.any(axis=1))
