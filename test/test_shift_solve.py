@@ -257,9 +257,7 @@ def test_what_the_calibration_shifts_no_number_of_stations_averages_out(
     # Far below the noise told, all weights are one.
     shift = 0.0001 * np.random.default_rng(6).standard_normal(len(slide))
     sigma = np.full(len(slide), 0.001)
-    found = _solved(
-        shift, sigma, slide, *_each(len(slide)), POSE, image_shift=across,
-        calibration_sigma=0.1)
+    found = _solved(shift, sigma, slide, *_each(len(slide)), POSE, image_sigma=0.1 * across)
     # A shift of the image by (u, v) moves the pose by -G (u, v), G from least squares.
     moved = np.linalg.lstsq(slide[:, :3], across, rcond=None)[0]
     expected = 0.01 * moved @ moved.T

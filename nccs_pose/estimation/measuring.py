@@ -225,13 +225,13 @@ class Measurer:
         :param slide: d(shift)/d(x, y, yaw, z, roll, pitch) (N, 6).
         :param index: which of the bands they are (N,).
         """
-        options = self._options
+        options, image_sigma = self._options, None
+        if options.calibration_sigma > 0.0:
+            image_sigma = options.calibration_sigma * bands.across.take(index, axis=0)
         return weigh_shifts(
             shift, sigma, slide, index // bands.members, bands.label.take(index), start,
             prior=prior, attitude_sigma=(options.height_sigma, options.tilt_sigma),
-            image_shift=(
-                bands.across.take(index, axis=0) if options.calibration_sigma > 0.0 else None),
-            calibration_sigma=options.calibration_sigma)
+            image_sigma=image_sigma)
 
 
 def _by_group(values: Array, bands: Bands) -> Array:

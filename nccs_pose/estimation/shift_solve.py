@@ -61,8 +61,7 @@ class WeighedShifts:
     :ivar first: the first of each sum of neighbours whose errors are looked at together (G,).
     :ivar known: information about the unknowns beforehand (K, K).
     :ivar told: that times what is expected of them (K,).
-    :ivar image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift
-        it by (N, 2), px; None where that is nothing.
+    :ivar image_sigma: as of :func:`weigh_shifts`.
     """
 
     start: Pose2
@@ -131,8 +130,7 @@ def weigh_shifts(
     *,
     prior: tuple[Pose2, Array] | None = None,
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
-    image_shift: Array | None = None,
-    calibration_sigma: float = 0.0,
+    image_sigma: Array | None = None,
 ) -> WeighedShifts:
     """Weigh N measured shifts by how well they agree on a step of the pose.
 
@@ -157,8 +155,8 @@ def weigh_shifts(
     :param prior: a pose with its information (3, 3), weighed in like a measurement.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held.
-    :param image_shift: d(shift)/d(u, v) of the whole image (N, 2).
-    :param calibration_sigma: what the calibration may shift the whole image by, px.
+    :param image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift it
+        by (N, 2), px; None where that is nothing.
     """
     free, known, told = _prior(start, prior, attitude_sigma)
     rows = np.empty((len(free) + 1, len(shift)))
@@ -169,9 +167,6 @@ def weigh_shifts(
     square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
     inlier = (square <= GATE**2).repeat(members)
     root = np.maximum(1.0 - square / _FORGOTTEN**2, _NOTHING).repeat(members)
-    image_sigma = None
-    if calibration_sigma > 0.0 and image_shift is not None:
-        image_sigma = calibration_sigma * image_shift
     return WeighedShifts(
         start, free, rows[:-1], sigma, root, inlier, label, sums_of_neighbours(first, label),
         known, told, image_sigma)
