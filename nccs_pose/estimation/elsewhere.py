@@ -45,8 +45,7 @@ _TRIED = 4
 _GATE = 3.0
 # Lines lie better elsewhere if they explain so much more there, counting how well they lie.
 _FITS_BETTER = 0.05
-FITS_ELSEWHERE = Objection('its lines lie better on another pose')
-"""What is said against an expected pose that may be another one of a map nearly symmetric."""
+_FITS_ELSEWHERE = Objection('its lines lie better on another pose')
 _ANOTHER = Objection('another pose explains the image better')
 _AS_WELL = Objection('another place where the robot may be by now explains the image as well')
 
@@ -88,7 +87,7 @@ class Elsewhere:
             return Refused(against, alignment)
         if is_suspect(alignment) and self._fits_better(image, alignment, segments):
             # Without the alignment, which others would have to beat by what they explain.
-            return Refused(FITS_ELSEWHERE)
+            return Refused(_FITS_ELSEWHERE, misled=True)
         vague = prediction.is_vague
         here, _ = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
@@ -110,13 +109,13 @@ class Elsewhere:
         self, image: NDArray[np.uint8], alignment: Alignment, segments: Strips,
     ) -> bool:
         """Whether the lines lie better on a place from where the map looks nearly the same."""
-        here = alignment.explained * fit_of(alignment.points.variance)
+        here = _worth(alignment)
         for place in self._searcher.taken_for(alignment.pose, segments):
             other = self._aligner.align(
                 image, place.pose, alignment.colours, reach=SEARCH_BAND)
             if other is None or same_pose(other.pose, alignment.pose):
                 continue
-            if other.explained * fit_of(other.points.variance) > here + _FITS_BETTER:
+            if _worth(other) > here + _FITS_BETTER:
                 return True
         return False
 
@@ -160,3 +159,8 @@ class Elsewhere:
         steps = np.unique(np.round((across[:, None] - across) / _APART)) * _APART
         steps = steps[steps != 0.0]
         return steps[np.argsort(np.abs(steps)), None] * normal
+
+
+def _worth(alignment: Alignment) -> float:
+    """How much a pose explains of what should be seen, counting how well its lines lie."""
+    return alignment.explained * fit_of(alignment.points.variance)

@@ -40,10 +40,17 @@ ABOUT_AS_MUCH = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A pose that was laid on the image, and what the image says against it."""
+    """A pose that was laid on the image, and what the image says against it.
+
+    :ivar objection: None if nothing lay there to object to.
+    :ivar alignment: the pose; None where it is not to be compared with others.
+    :ivar misled: whether the prediction itself may be of another place of a map nearly symmetric:
+        then no pose is believed for being expected.
+    """
 
     objection: Objection | None = None
     alignment: Alignment | None = None
+    misled: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,6 @@ from nccs_pose.estimation.case import Case
 from nccs_pose.estimation.coasting import may_coast, shows_another_place, shows_this_place
 from nccs_pose.estimation.course import Course
 from nccs_pose.estimation.decision import left_open, may_show, the_one_expected
-from nccs_pose.estimation.elsewhere import FITS_ELSEWHERE
 from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.frame import Frame
@@ -221,8 +220,7 @@ class Localiser:
         :param refused: what came of following the robot to the image.
         """
         is_first = frame.prediction is None and not self._open
-        if refused.objection is FITS_ELSEWHERE:
-            # A pose is no longer believed for being expected.
+        if refused.misled:
             frame = replace(frame, prediction=None)
         given = None if self._given is None else self._given.carried_on(
             frame.stamp_ns, frame.wheels)
