@@ -219,10 +219,8 @@ def _promising(
     there = there[best]
     score = _harmonic(claimed, scorer.explained(poses, _COARSE))
     found = sorted(distinct(poses, score), key=lambda k: not there[k])
-    guessed = found[_REFINED:]
-    return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
-        poses[guessed].listed(),
-        *(part[guessed].tolist() for part in (score, claimed, misfit)))], others
+    return poses[found[:_REFINED]], _listed(
+        poses, score, claimed, misfit, found[_REFINED:]), others
 
 
 def _fitted(
@@ -230,9 +228,15 @@ def _fitted(
 ) -> list[FittedCandidate]:
     """Poses and what is known of them, as of :meth:`.StripScorer.refined`; one of each."""
     score = _harmonic(claimed, scorer.explained(poses))
-    found = distinct(poses, score)
+    return _listed(poses, score, claimed, misfit, distinct(poses, score))
+
+
+def _listed(
+    poses: Poses, score: Array, claimed: Array, misfit: Array, which: list[int],
+) -> list[FittedCandidate]:
+    """Some of H poses, each with what is known of it (H,)."""
     return [FittedCandidate(*of) for of in zip(
-        poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
+        poses[which].listed(), *(part[which].tolist() for part in (score, claimed, misfit)))]
 
 
 def _harmonic(a: Array, b: Array) -> Array:
