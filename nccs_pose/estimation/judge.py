@@ -24,11 +24,10 @@ from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.line_history import BEYOND_DOUBT, LineHistory, WEAK
-from nccs_pose.estimation.misplaced import placement, plainly_in_place
+from nccs_pose.estimation.misplaced import LineFinder, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import COINCIDENT
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.verdict import (
     contradiction,
@@ -38,15 +37,11 @@ from nccs_pose.estimation.verdict import (
     Objection,
     objection,
 )
-from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
 
-# Stations of a line that is looked for beside its place stand so close, px.
-_CLOSE = 4.0
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
 # what is seen, one on three lines that of either; more lines speak for themselves. Where one
 # is missing, fewer strips than this are no evidence: they lie on lines at any pose made of them.
@@ -91,12 +86,11 @@ class Judge:
     """Judges poses laid on images of one rig and map."""
 
     def __init__(
-        self, searcher: Searcher, predictor: BandPredictor, table: FloorTable, line_map: LineMap,
+        self, searcher: Searcher, finder: LineFinder, line_map: LineMap,
         options: LocaliserOptions,
     ) -> None:
-        self._predictor = predictor
         self._searcher = searcher
-        self._table = table
+        self._finder = finder
         self._map = line_map
         self._options = options
 
@@ -126,16 +120,7 @@ class Judge:
             asked -= plainly_in_place(alignment) | history.unasked(alignment)
         if not asked:
             return None
-        colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
-        places = self._predictor.places(
-            alignment.pose, _CLOSE, self._options.stations, asked)
-        bands, slide = self._predictor.bands(places, alignment.pose)
-        moved = slide[:, 3:] @ alignment.refinement.attitude
-        for k in sorted(asked):
-            own = bands.label == k
-            seen = placement(
-                image, k, bands[own], moved[own], colours[self._map[k].colour],
-                self._options.band, alignment, self._map, self._table)
+        for k, seen in self._finder.placements(image, alignment, asked):
             if seen.beside is not None:
                 return Objection(
                     f'{line_name(self._map, k)} is seen {seen.beside:.1f} px beside its place',

@@ -45,6 +45,7 @@ from nccs_pose.estimation.judge import Found, Judge
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.misplaced import LineFinder
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.odometry import Odometry
@@ -119,8 +120,8 @@ class Localiser:
         aligner = Aligner(self._table, self._map, options)
         self._nominal_colours = aligner.nominal_colours
         self._searcher = Searcher(self._table, self._map, options)
-        self._judge = Judge(
-            self._searcher, aligner.predictor, self._table, self._map, options)
+        finder = LineFinder(aligner.predictor, self._table, self._map, options)
+        self._judge = Judge(self._searcher, finder, self._map, options)
         self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
         rivals = Rivals(aligner, self._searcher, self._judge, self._symmetries, options)
         self._sifter = Sifter(aligner, self._judge, rivals, self._symmetries, options)
