@@ -63,7 +63,7 @@ _UNFIXED = Objection('the lines that it rests on do not fix a pose')
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A pose that holds.
+    """A pose laid on an image, and how much that shows of it; as a verdict, one that holds.
 
     :ivar alignment: as laid on the image.
     :ivar claimed: fraction of the line-like pixels that it explains; NaN if not looked at.
@@ -79,7 +79,7 @@ class Found:
     @property
     def shown(self) -> float:
         """How much it explains, however well its lines lie on the image, 0 to 1."""
-        return shown(self.by_strips, self.alignment)
+        return _shown(self.by_strips, self.alignment)
 
 
 class Judge:
@@ -167,20 +167,7 @@ class Judge:
         found = self.measured(alignment, segments, candidate)
         if found.score <= 0.0:
             return _NOTHING
-        used = lines_used(alignment)
-        weaker, stronger = sorted((found.claimed, alignment.explained))
-        if alignment.missing and len(segments) < _LEAST_STRIPS:
-            stronger = alignment.explained
-        least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
-        if not expected and least < _MOST:
-            return _unexplained(used)
-        broad = set(alignment.whole[
-            (alignment.support > WEAK) & (alignment.width >= _BROAD)].tolist())
-        if not expected and len(broad) < 2:
-            return Objection(
-                f'all but {len(broad)} of the lines that it rests on are thinner '
-                f'than {_BROAD} px', hidden=True)
-        return found
+        return found if expected else _too_little(found, len(segments)) or found
 
     def beforehand(
         self, candidate: FittedCandidate, lines_in_view: Callable[[Pose2], int],
@@ -202,15 +189,35 @@ class Judge:
         score, claimed = (candidate.score, candidate.claimed) if candidate is not None else (
             self._searcher.score(alignment.pose, segments))
         return Found(
-            alignment, claimed, shown(score, alignment) * fit_of(alignment.points.variance),
+            alignment, claimed, _shown(score, alignment) * fit_of(alignment.points.variance),
             score)
+
+
+def _too_little(found: Found, strips: int) -> Objection | None:
+    """Why a pose that nothing expects rests on too little; None if it does not.
+
+    :param strips: how many the image shows.
+    """
+    alignment, used = found.alignment, lines_used(found.alignment)
+    weaker, stronger = sorted((found.claimed, alignment.explained))
+    if alignment.missing and strips < _LEAST_STRIPS:
+        stronger = alignment.explained
+    if {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0) < _MOST:
+        return _unexplained(used)
+    broad = set(alignment.whole[
+        (alignment.support > WEAK) & (alignment.width >= _BROAD)].tolist())
+    if len(broad) < 2:
+        return Objection(
+            f'all but {len(broad)} of the lines that it rests on are thinner than {_BROAD} px',
+            hidden=True)
+    return None
 
 
 def _unexplained(lines: int) -> Objection:
     return Objection(f'it rests on {lines} lines and leaves too much unexplained', hidden=True)
 
 
-def shown(by_strips: float, alignment: Alignment) -> float:
+def _shown(by_strips: float, alignment: Alignment) -> float:
     """How much a pose explains by strips and by the lines that should be seen, 0 to 1."""
     return math.sqrt(by_strips * alignment.explained)
 

@@ -54,7 +54,7 @@ DOUBTS = (_DOUBTFUL, _ON_A_CORNER, _TWO_COARSE)
 
 
 class Rivals:
-    """Of poses that hold on images of one rig and map."""
+    """Looks for rivals of poses that hold on images of one rig and map."""
 
     def __init__(
         self, aligner: Aligner, searcher: Searcher, judge: Judge, symmetries: tuple[Pose2, ...],
