@@ -27,7 +27,7 @@ from nccs_pose.estimation.judge import fit_of
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
 from nccs_pose.estimation.motion import Prediction
-from nccs_pose.estimation.observability import COINCIDENT
+from nccs_pose.estimation.observability import parallel_to
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
 from nccs_pose.estimation.verdict import contradiction, is_suspect, Objection
@@ -151,9 +151,9 @@ class Elsewhere:
 
     def _steps_across(self, line: int) -> Array:
         """What lays a map's lines on parallel ones of their colour (K, 2), metres, least first."""
-        x, y, _ = self._map.directions.T
-        normal = np.array([-y[line], x[line]])
-        parallel = np.abs(x * y[line] - y * x[line]) < COINCIDENT
+        direction = self._map.directions[line]
+        normal = np.array([-direction[1], direction[0]])
+        parallel = parallel_to(direction, self._map.directions)
         parallel &= np.array([other.colour == self._map[line].colour for other in self._map])
         across = self._map.starts[parallel, :2] @ normal
         steps = np.unique(np.round((across[:, None] - across) / _APART)) * _APART

@@ -26,7 +26,7 @@ from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.line_history import BEYOND_DOUBT, LineHistory, WEAK
 from nccs_pose.estimation.misplaced import LineFinder, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
-from nccs_pose.estimation.observability import COINCIDENT
+from nccs_pose.estimation.observability import parallel_to
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.verdict import (
@@ -153,8 +153,8 @@ class Judge:
         """
         if against is not _UNFIXED:
             return bool(alignment.missing)
-        x, y, _ = self._map.directions[alignment.support >= 0.0].T
-        return bool(np.abs(x * y[0] - y * x[0]).max() > COINCIDENT)
+        in_view = self._map.directions[alignment.support >= 0.0]
+        return not parallel_to(in_view[0], in_view).all()
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
