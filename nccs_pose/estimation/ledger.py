@@ -277,8 +277,7 @@ class Ledger:
         poses = poses[new]
         if self.best is not None and self._best_candidate is not None:
             # Strips that lie askew do so at all places where they look the same.
-            poses = poses.and_on_by(
-                self._best_candidate.pose.inverse() @ self.best.alignment.pose)
+            poses = poses @ (self._best_candidate.pose.inverse() @ self.best.alignment.pose)
         return [Candidate(*of) for of in zip(poses.listed(), score[new].tolist())]
 
 

@@ -51,8 +51,8 @@ class Poses:
     ) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
-    def and_on_by(self, step: Pose2) -> Poses:
-        """Where a robot is that goes on from each by the same step, of base_link."""
+    def __matmul__(self, step: Pose2) -> Poses:
+        """Compose each with the same step, as of :class:`.Pose2`."""
         return Poses(
             self.rotation * complex(math.cos(step.yaw), math.sin(step.yaw)),
             self.place + self.rotation * complex(step.x, step.y))

@@ -46,8 +46,8 @@ _SEARCHED_SPACING = 8.0
 # A pass misses less than this part of the way to where it leads.
 _MOST_MISSED = 0.5
 
-# Some of a row of things: a slice, or a mask.
-Some = slice | NDArray[np.bool_]
+# Which of a row of things: a slice, or a mask.
+Selection = slice | NDArray[np.bool_]
 _ALL = slice(None)
 
 
@@ -61,8 +61,8 @@ class Part(NamedTuple):
     """
 
     colour: int
-    own: Some
-    groups: Some
+    own: Selection
+    groups: Selection
     bands: Bands
 
 
