@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
+from nccs_pose.estimation.estimate import Stage
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import AS_MUCH
@@ -84,7 +85,7 @@ class Sight:
 
 def sights(
     image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
-    gate: Gate | None, lap: Callable[[str], None],
+    gate: Gate | None, lap: Callable[[Stage], None],
 ) -> Iterator[Sight]:
     """Look at an image in one way after the other, for sights on which poses are worth a try.
 
