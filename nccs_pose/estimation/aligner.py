@@ -24,6 +24,7 @@ from nccs_pose.estimation.alignment import Alignment, close, leaves_open, Pass
 from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -123,7 +124,7 @@ class Aligner:
         colours: tuple[LineColour, ...],
         *,
         reach: float = 0.0,
-        prior: tuple[Pose2, Array] | None = None,
+        prior: Prior | None = None,
         hopeless: Callable[[Alignment], bool] | None = None,
         laid: Pose2 | None = None,
     ) -> Alignment | None:
@@ -132,8 +133,7 @@ class Aligner:
         :param image: (H, W, 3) uint8 BGR.
         :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
             are searched first; 0 is for a start that is most likely right.
-        :param prior: a pose with its information (3, 3): carries the directions that the lines in
-            view do not fix.
+        :param prior: carries the directions that the lines in view do not fix.
         :param hopeless: says of a pose that has nearly settled whether it is refused in any case.
             If so it is given as it is, which saves the last passes; so is one of which the lines
             leave a direction open.
@@ -157,7 +157,7 @@ class Aligner:
 
     def _settled(
         self, image: NDArray[np.uint8], places: Places, state: _State,
-        prior: tuple[Pose2, Array] | None, reach: float,
+        prior: Prior | None, reach: float,
         hopeless: Callable[[Alignment], bool] | None,
     ) -> Alignment | None:
         """Pass over an image until the pose moves no more, or will be refused in any case.
@@ -224,7 +224,7 @@ class Aligner:
         return self._places(Pose2(metres * column, metres * row, radians * turn))
 
     def _searched(
-        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        self, image: NDArray[np.uint8], start: Pose2, prior: Prior | None,
         colours: tuple[LineColour, ...], reach: float, laid: Pose2 | None,
     ) -> Pose2 | None:
         """Where a search across the bands leads; None where to nothing, or to nothing new."""
@@ -240,7 +240,7 @@ class Aligner:
 
     def _begun(
         self, image: NDArray[np.uint8], places: Places, start: _State,
-        prior: tuple[Pose2, Array] | None, reach: float,
+        prior: Prior | None, reach: float,
     ) -> _State | None:
         """What to go on from with all stations.
 

@@ -30,6 +30,7 @@ from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import parallel_to
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.estimation.verdict import contradiction, is_suspect, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -144,7 +145,7 @@ class Elsewhere:
         for pose in islice(filter(gate.contains, places), _TRIED):
             other = self._aligner.align(
                 image, pose, alignment.colours, reach=self._options.band,
-                prior=(pose, prediction.information))
+                prior=Prior(pose, prediction.information))
             if other is not None and other.explained >= least:
                 return True
         return False

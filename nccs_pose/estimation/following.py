@@ -25,6 +25,7 @@ from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.verdict import is_suspect
 from nccs_pose.geometry.lines import LineMap
@@ -76,7 +77,7 @@ class Follower:
         history: LineHistory, watch: Stopwatch,
     ) -> Alignment | Refused:
         """Lay a predicted pose on an image: in its place or, if it does not hold, beside it."""
-        prior = (prediction.pose, prediction.information)
+        prior = Prior(prediction.pose, prediction.information)
         refused = Refused()
         for reach in (0.0, self._options.band):
             alignment = self._aligner.align(

@@ -23,7 +23,7 @@ from nccs_pose.estimation.alignment import Pass
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import weigh_shifts, WeighedShifts
+from nccs_pose.estimation.shift_solve import Prior, weigh_shifts, WeighedShifts
 from nccs_pose.estimation.whole_lines import first_pieces
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -123,12 +123,9 @@ class Measurer:
         return Look(pose, attitude, bands, slide.T, read, rough)
 
     def measure(
-        self, look: Look, prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...],
+        self, look: Look, prior: Prior | None, colours: tuple[LineColour, ...],
     ) -> Pass | None:
-        """Measure what was read, and solve; None where too few stations are felt.
-
-        :param prior: a pose with its information (3, 3).
-        """
+        """Measure what was read, and solve; None where too few stations are felt."""
         bands, slide, learned = look.bands, look.slide, list(colours)
         n = len(bands)
         shift, sigma, found = np.empty(n), np.empty(n), np.empty(n, dtype=bool)
@@ -168,14 +165,13 @@ class Measurer:
             look, first.weighed, replace(fit, shift=shift), first.used, tuple(colours))
 
     def search(
-        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        self, image: NDArray[np.uint8], start: Pose2, prior: Prior | None,
         colours: tuple[LineColour, ...], reach: float,
     ) -> Refinement | None:
         """Look for the tapes up to so many pixels beside where a pose predicts them, and solve.
 
         :param image: (H, W, 3) uint8 BGR.
         :param start: the predicted pose, T_map_base.
-        :param prior: a pose with its information (3, 3), weighed in like a measurement.
         :param colours: what the tapes look like, one for each class.
         :param reach: to either side, px.
         :returns: None where too few stations show one.
@@ -216,7 +212,7 @@ class Measurer:
 
     def _weigh(
         self, shift: Array, sigma: Array, slide: Array, index: NDArray[np.intp], bands: Bands,
-        start: Pose2, prior: tuple[Pose2, Array] | None,
+        start: Pose2, prior: Prior | None,
     ) -> WeighedShifts:
         """Weigh what some stations say of the pose.
 

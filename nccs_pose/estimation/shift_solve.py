@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import NamedTuple
 
 from nccs_pose.estimation.common_errors import common_variance, sums_of_neighbours
 from nccs_pose.estimation.refine import Refinement
@@ -45,6 +46,13 @@ _ITERATIONS = 8
 # its own.
 _FOUND = 1.0
 _ONE = np.eye(6)
+
+
+class Prior(NamedTuple):
+    """A pose that is weighed in like a measurement, T_map_base, and its information (3, 3)."""
+
+    pose: Pose2
+    information: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +136,7 @@ def weigh_shifts(
     label: NDArray[np.intp],
     start: Pose2,
     *,
-    prior: tuple[Pose2, Array] | None = None,
+    prior: Prior | None = None,
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
     image_sigma: Array | None = None,
 ) -> WeighedShifts:
@@ -152,7 +160,7 @@ def weigh_shifts(
     :param group: of neighbours that each belongs to (N,), those of a group together.
     :param label: map line of each (N,), ascending, along each line in order.
     :param start: the predicted pose, T_map_base.
-    :param prior: a pose with its information (3, 3), weighed in like a measurement.
+    :param prior: what is known of the pose beforehand.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held.
     :param image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift it
@@ -200,7 +208,7 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
 
 
 def _prior(
-    start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
+    start: Pose2, prior: Prior | None, attitude_sigma: tuple[float, float],
 ) -> tuple[NDArray[np.intp], Array, Array]:
     """Free unknowns, the information about them (K, K), and that times their expected step (K,).
 
@@ -209,9 +217,8 @@ def _prior(
     free, vague = _unknowns(*attitude_sigma)
     information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
-        pose, known = prior
-        information[:3, :3] += known
-        told[:3] = known.dot(pose.minus(start))
+        information[:3, :3] += prior.information
+        told[:3] = prior.information.dot(prior.pose.minus(start))
     return free, information, told
 
 
