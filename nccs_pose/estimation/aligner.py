@@ -153,18 +153,19 @@ class Aligner:
             return None
         begun = self._begun(image, places, _State(pose, np.zeros(3), colours), prior, reach)
         return None if begun is None else self._settled(
-            image, places, begun, prior, reach, hopeless)
+            image, places, begun, prior, followed=reach == 0.0, hopeless=hopeless)
 
     def _settled(
-        self, image: NDArray[np.uint8], places: Places, state: _State,
-        prior: Prior | None, reach: float,
-        hopeless: Callable[[Alignment], bool] | None,
+        self, image: NDArray[np.uint8], places: Places, state: _State, prior: Prior | None, *,
+        followed: bool, hopeless: Callable[[Alignment], bool] | None,
     ) -> Alignment | None:
         """Pass over an image until the pose moves no more, or will be refused in any case.
 
         :param places: where the stations stand to begin with.
+        :param followed: whether the start is most likely right: one pass may do.
+        :param hopeless: as of :meth:`align`.
         """
-        followed, before = reach == 0.0, state.pose
+        before = state.pose
         for k in range(_ITERATIONS):
             look = self._measurer.look(image, places, state.pose, state.attitude, state.colours)
             if look is None:
@@ -239,8 +240,8 @@ class Aligner:
         return searched.pose
 
     def _begun(
-        self, image: NDArray[np.uint8], places: Places, start: _State,
-        prior: Prior | None, reach: float,
+        self, image: NDArray[np.uint8], places: Places, start: _State, prior: Prior | None,
+        reach: float,
     ) -> _State | None:
         """What to go on from with all stations.
 
