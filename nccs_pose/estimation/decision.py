@@ -33,36 +33,33 @@ _CARRIED = 8
 
 
 def the_one_expected(
-    held: Sequence[Found], sifted: Sifted, gate: Gate | None,
-    prediction: Prediction | None, options: LocaliserOptions,
+    sifted: Sifted, gate: Gate | None, prediction: Prediction | None, options: LocaliserOptions,
 ) -> Found | None:
     """The one pose that a prior or a prediction expects, if it is one of the best of all.
 
-    :param held: the poses that explain the image, best first.
-    :param sifted: what else the search of it left.
+    :param sifted: what the search of the image left; some pose explains it.
     :param gate: about the prediction or, without one, a prior.
     """
     if gate is None:
         return None
-    near = [f for f in held if (
+    near = [f for f in sifted.held if (
         gate.contains(f.alignment.pose, f.alignment.covariance) if prediction is None
         else is_expected(f.alignment, prediction, options.innovation_gate))]
     if not near or _leaves_any(gate, sifted):
         return None
     best, ratio = near[0], options.ambiguity_ratio
-    if best.score + BETTER < held[0].score or any(
+    if best.score + BETTER < sifted.held[0].score or any(
             f.score >= ratio * best.score for f in near[1:]):
         return None
     return best
 
 
-def may_show(gate: Gate, held: Sequence[Found], sifted: Sifted) -> bool:
+def may_show(gate: Gate, sifted: Sifted) -> bool:
     """Whether an image may show a pose inside a gate.
 
-    :param held: the poses that explain it.
-    :param sifted: what else the search of it left.
+    :param sifted: what the search of it left.
     """
-    return any(gate.contains(f.alignment.pose) for f in held) or _leaves_any(gate, sifted)
+    return any(gate.contains(f.alignment.pose) for f in sifted.held) or _leaves_any(gate, sifted)
 
 
 def _leaves_any(gate: Gate, sifted: Sifted) -> bool:
@@ -72,15 +69,15 @@ def _leaves_any(gate: Gate, sifted: Sifted) -> bool:
 
 
 def left_open(
-    hypotheses: Sequence[Hypothesis], held: Sequence[Found], sifted: Sifted,
+    hypotheses: Sequence[Hypothesis], sifted: Sifted,
 ) -> tuple[tuple[Hypothesis, ...], list[Candidate]]:
     """The poses among which an image has not decided, and the next one may.
 
     :param hypotheses: those that were open before it.
-    :param held: the poses that explain it, best first.
-    :param sifted: what else the search of it left.
+    :param sifted: what the search of it left; some pose explains it.
     :returns: those to be laid on the next image, and others that may be right as well.
     """
+    held = sifted.held
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
     # Scores of what is left open are of this image, as parts of its best; those of hypotheses are
     # means over several.

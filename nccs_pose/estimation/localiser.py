@@ -229,14 +229,13 @@ class Localiser:
         hypotheses = self._open.at(frame.stamp_ns, frame.wheels)
         looks, last = self._looks(frame, gate, hypotheses)
         sifted = looks[last]
-        held = sifted.held
-        self._in_vain = 0 if held else self._in_vain + 1
+        self._in_vain = 0 if sifted.held else self._in_vain + 1
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
             here = self._judge.measured(refused.alignment, last.segments).score
-            held = [f for f in held if f.score > here or same_pose(
-                f.alignment.pose, refused.alignment.pose)]
-        if not held:
+            sifted = replace(sifted, held=[f for f in sifted.held if f.score > here or same_pose(
+                f.alignment.pose, refused.alignment.pose)])
+        if not sifted.held:
             trusted = None if given is None else self._trusted(frame, given, last)
             if trusted is not None:
                 return self._tracking(
@@ -244,32 +243,32 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(frame, last, refused)
-        chosen = the_one_expected(held, sifted, gate, frame.prediction, self._options)
+        chosen = the_one_expected(sifted, gate, frame.prediction, self._options)
         if chosen is not None:
-            words = _FOUND if len(held) == 1 else (
+            words = _FOUND if len(sifted.held) == 1 else (
                 'several poses explain the image; the one expected was taken')
-            return self._tracking(frame, chosen, words, held=held)
-        return self._decided(frame, held, sifted, gate, hypotheses, is_first)
+            return self._tracking(frame, chosen, words, held=sifted.held)
+        return self._decided(frame, sifted, gate, hypotheses, is_first)
 
     def _decided(
-        self, frame: Frame, held: list[Found], sifted: Sifted, gate: Gate | None,
-        before: Sequence[Hypothesis], is_first: bool,
+        self, frame: Frame, sifted: Sifted, gate: Gate | None, before: Sequence[Hypothesis],
+        is_first: bool,
     ) -> Estimate:
         """Decide between poses by all images since they were first seen, or leave them open.
 
-        :param held: those that explain this image, best first.
-        :param sifted: what else the search of it left.
+        :param sifted: what the search of this image left; some pose explains it.
         :param before: those that the images before left open, where they are by now.
         :param is_first: whether nothing was expected of the image; else two have to agree.
         """
-        hypotheses, more = left_open(before, held, sifted)
+        held = sifted.held
+        hypotheses, more = left_open(before, sifted)
         self._open = OpenPoses(hypotheses, frame.stamp_ns, frame.wheels)
         best = hypotheses[0]
         if ambiguity(hypotheses) <= self._options.ambiguity_ratio and (
                 is_first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(frame, found, _FOUND, held=held)
-        if gate is not None and not may_show(gate, held, sifted):
+        if gate is not None and not may_show(gate, sifted):
             # Carried on for long, what was expected would agree with one of them by chance.
             if self._refuted_ns is None:
                 self._refuted_ns = frame.stamp_ns
