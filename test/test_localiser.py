@@ -351,12 +351,12 @@ def test_what_was_refused_at_one_look_is_not_laid_at_the_next(
 
     monkeypatch.setattr(Aligner, 'align', missing)
 
-    def twice(*place: Any) -> Iterator[Sight]:
-        for sight in look(*place):
+    def twice(*place: Any, **how: Any) -> Iterator[Sight]:
+        for sight in look(*place, **how):
             yield from (sight, sight)
 
-    def with_its_like(*place: Any) -> Iterator[Sight]:
-        for sight in look(*place):
+    def with_its_like(*place: Any, **how: Any) -> Iterator[Sight]:
+        for sight in look(*place, **how):
             yield from (sight, replace(sight))
 
     for sights in (look, twice, with_its_like):

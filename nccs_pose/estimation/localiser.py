@@ -209,7 +209,7 @@ class Localiser:
         watch.lap('predict')
         if prediction is None:
             return self._search(frame, Refused())
-        followed = self._follower.follow(image, prediction, self._colours, self._history, watch)
+        followed = self._follower.follow(frame, prediction, self._colours, self._history)
         if isinstance(followed, Found):
             return self._tracking(
                 frame, followed, 'the pose explains the image', prior=prediction)
@@ -284,8 +284,8 @@ class Localiser:
         :returns: what came of each sight, in order, and the one to go by.
         """
         looks: dict[Sight, Sifted] = {}
-        for sight in sights(frame.image, self._searcher, self._fresh_colours(), self._in_vain,
-                            gate, frame.watch.lap):
+        for sight in sights(
+                frame, self._searcher, self._fresh_colours(), gate, in_vain=self._in_vain):
             # One that comes again would come to the same.
             if sight not in looks:
                 looks[sight] = self._sifter.sift(
@@ -308,8 +308,7 @@ class Localiser:
 
     def _trusted(self, frame: Frame, given: Prediction, sight: Sight) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""
-        followed = self._follower.follow(
-            frame.image, given, self._colours, self._history, frame.watch)
+        followed = self._follower.follow(frame, given, self._colours, self._history)
         if not isinstance(followed, Found):
             return None
         _, claimed = self._searcher.score(followed.alignment.pose, sight.segments)
