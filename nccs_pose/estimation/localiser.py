@@ -178,7 +178,7 @@ class Localiser:
         try:
             self._odometry.add(stamp_ns, pose)
         except FrameRefusedError:
-            self._open = replace(self._open, odometry=None)
+            self._open = replace(self._open, wheels=None)
             if self._given is not None:
                 self._given.forget_odometry()
             self._course = self._course.without_odometry()

@@ -53,12 +53,12 @@ PAST = 3
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The last pose that an image gave.
+    """A pose that an image gave.
 
     :ivar stamp_ns: of the image.
     :ivar pose: T_map_base.
     :ivar covariance: of (x, y, yaw) (3, 3).
-    :ivar odometry: what the wheels said then; None without odometry.
+    :ivar wheels: what they said then; None without odometry.
     :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
     :ivar seen_way: how far the wheels had rolled then, metres; None if they did not say.
     """
@@ -66,7 +66,7 @@ class Track:
     stamp_ns: int
     pose: Pose2
     covariance: Array
-    odometry: Wheels | None
+    wheels: Wheels | None
     seen_ns: int
     seen_way: float | None = None
 
