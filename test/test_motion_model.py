@@ -354,14 +354,14 @@ def test_a_direction_out_of_sight_grows_uncertain_since_it_was_last_seen() -> No
     assert by_velocity((before,), unseen, SECOND + SECOND // 10) is None
 
 
-def test_the_floor_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
+def test_the_inflation_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
     """Against the solution of both problems written out: x observed, y not."""
     carried = np.diag([0.03, 0.05, 0.01]) ** 2
     prediction = Prediction(START, carried, True)
     image = np.diag([1.0 / 0.001**2, 0.0, 1.0 / 0.002**2])
     solved = np.linalg.inv(image + np.linalg.inv(prediction.covariance))
     for multiple in (1.0, 4.0):
-        got = prediction.without_floor(multiple * solved, solved)
+        got = prediction.without_inflation(multiple * solved, solved)
         assert np.sqrt(got[1, 1]) == pytest.approx(0.05, rel=1e-9)
         # What the image sees keeps its own uncertainty: never less for having a good prediction.
         assert np.sqrt(got[0, 0]) == pytest.approx(np.sqrt(multiple) * 0.001, rel=0.01)

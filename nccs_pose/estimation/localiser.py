@@ -325,7 +325,7 @@ class Localiser:
         """
         alignment, covariance = found.alignment, found.alignment.covariance
         if prior is not None:
-            covariance = prior.without_floor(covariance, alignment.refinement.covariance)
+            covariance = prior.without_inflation(covariance, alignment.refinement.covariance)
         # Whoever is told of it shares it with the track.
         covariance.setflags(write=False)
         unobserved = unobserved_directions(
