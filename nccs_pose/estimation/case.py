@@ -19,11 +19,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from nccs_pose.estimation.aligner import LINEAR_PX
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
+from nccs_pose.estimation.measuring import LINEAR_PX
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.sights import Sight
 from nccs_pose.geometry.pose import Pose2

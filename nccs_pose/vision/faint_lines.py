@@ -24,7 +24,7 @@ import math
 
 import cv2
 from nccs_pose.vision.median import noise_deviation, upper_median
-from nccs_pose.vision.segment import Mask
+from nccs_pose.vision.segment import Mask, smoothed
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,7 +55,7 @@ def faint_line_mask(feature: Mask, floor: Mask, gate: float, window: int) -> Mas
     :param window: width of the surroundings, px.
     """
     sample = floor[::_SPARSE, ::_SPARSE] > 0
-    height = cv2.GaussianBlur(feature, (3, 3), 0.8).astype(np.float32)
+    height = smoothed(feature).astype(np.float32)
     # A median follows the rim of a thing, beside which a mean would be of both.
     height -= cv2.medianBlur(feature, window | 1)
     most = _MOST * max(noise_deviation(height[::_SPARSE, ::_SPARSE][sample]), _ROUNDING[0])
