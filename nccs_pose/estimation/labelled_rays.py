@@ -79,7 +79,7 @@ class LabelledRays:
         if not used.all():
             self.index, lines = (np.cumsum(used) - 1)[label], lines[used]
         self.origin = _middle(lines)
-        lines[:, 3:] = moments_about(self.origin, lines[:, :3], lines[:, 3:])
+        lines[:, 3:] = _moments_about(self.origin, lines[:, :3], lines[:, 3:])
         self.lines = lines
         self.sigma2 = sigma * sigma
         self._sigma2_world = sigma_world**2
@@ -184,7 +184,7 @@ def into_base(pose: Pose2) -> Array:
         [0.0, 0.0, -q, c, s, 0.0], [0.0, 0.0, p, -s, c, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]])
 
 
-def moments_about(origin: Array, directions: Array, moments: Array) -> Array:
+def _moments_about(origin: Array, directions: Array, moments: Array) -> Array:
     """Moments (L, 3) of lines about a point (2,) on the ground, mu - o x d."""
     # d times the matrix is d x o.
     return moments + directions @ cross_matrix(np.append(origin, 0.0))
