@@ -41,10 +41,12 @@ SPACING = 2.0
 _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
 # Where the image is sharp, so that a tape is found from nearby only, or the start is a little off,
-# a first, rough pass takes one station in four. Where more curve than this is in view, px, these
-# few show what tapes look like as well, and a second pass takes one in two.
-_SOME = (4, 2)
+# a first, rough pass takes one station in so many.
+_FEW = 4
+# Where more curve than this is in view, px, these few show what tapes look like as well, and a
+# second pass takes one in so many.
 _LONG = 2000.0
+_MORE = 2
 # A start that should be off by LINEAR_PX at most, but is moved by more than this, px, in its first
 # pass is nowhere near.
 _ASTRAY_PX = 5.0
@@ -250,11 +252,15 @@ class Aligner:
         """
         inexact = _sharpest(start.colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
         long = reach > 0.0 and places.length > _LONG
-        if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
+        if not (inexact or long) or len(places) < _FEW * LEAST_STATIONS:
             return start
         followed, state = reach == 0.0, start
-        # A robot that is followed may be so far off that it takes two.
-        for k, step in enumerate(_SOME[:1] * 2 if followed else _SOME[:1 + long]):
+        if followed:
+            # It may be so far off that it takes two.
+            steps: tuple[int, ...] = (_FEW, _FEW)
+        else:
+            steps = (_FEW, _MORE) if long else (_FEW,)
+        for k, step in enumerate(steps):
             sharpest = _sharpest(state.colours)
             look = self._measurer.look(
                 image, places.every(step), state.pose, state.attitude, state.colours,
