@@ -22,11 +22,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.judge import Found
 from nccs_pose.estimation.ledger import Ledger
 from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -47,21 +47,21 @@ def _found(pose: Pose2, score: float, by_strips: float = 0.8) -> Found:
     return Found(_alignment(pose), 1.0, score, by_strips)
 
 
-def _strips(
+def _candidate(
     pose: Pose2, score: float, claimed: float = 1.0, misfit: float = 0.0,
 ) -> FittedCandidate:
     return FittedCandidate(pose, score, claimed, misfit)
 
 
 def _ledger(
-    symmetries: tuple[Pose2, ...], told: Told | None, left: Sequence[FittedCandidate],
+    symmetries: tuple[Pose2, ...], gate: Gate | None, left: Sequence[FittedCandidate],
     others: Sequence[Pose2] = (),
 ) -> Ledger:
-    return Ledger(symmetries, told, RATIO, left, Poses.of(others))
+    return Ledger(symmetries, gate, RATIO, left, Poses.of(others))
 
 
-def _told(pose: Pose2) -> Told:
-    return Told(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
+def _gate(pose: Pose2) -> Gate:
+    return Gate(pose, np.diag([0.1, 0.1, 0.1])**2, 3.0)
 
 
 def _are(poses: Sequence[Pose2], expected: Sequence[Pose2]) -> bool:
@@ -76,7 +76,7 @@ def test_a_pose_is_known_with_its_twins() -> None:
     ledger.refuse(AWAY, _found(HERE, 0.5))
     assert ledger.knows(HERE) and ledger.was_laid(HERE)
     assert ledger.knows(HALF_TURN @ HERE) and not ledger.was_laid(HALF_TURN @ HERE)
-    ledger.begin(THERE)
+    ledger.settle_twins(THERE)
     assert ledger.knows(HALF_TURN @ THERE) and not ledger.knows(THERE)
     assert not ledger.knows(NOWHERE)
 
@@ -84,15 +84,15 @@ def test_a_pose_is_known_with_its_twins() -> None:
 def test_twins_are_laid_on_the_image_where_the_robot_is_told_to_be() -> None:
     twin = HALF_TURN @ HERE
     assert _ledger((HALF_TURN,), None, ()).hold(_found(HERE, 0.9), None) == []
-    ledger = _ledger((HALF_TURN,), _told(twin), ())
+    ledger = _ledger((HALF_TURN,), _gate(twin), ())
     assert ledger.hold(_found(HERE, 0.9), None) == [twin]
     assert not ledger.knows(twin)
     assert ledger.closed().open == []
 
 
 def test_what_holds_leaves_its_twins_open() -> None:
-    for told in (None, _told(HERE)):
-        ledger = _ledger((HALF_TURN,), told, ())
+    for gate in (None, _gate(HERE)):
+        ledger = _ledger((HALF_TURN,), gate, ())
         ledger.hold(_found(HERE, 0.9), None)
         twin, = ledger.closed().open
         assert twin.pose == HALF_TURN @ HERE
@@ -100,11 +100,11 @@ def test_what_holds_leaves_its_twins_open() -> None:
 
 
 def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() -> None:
-    left = [_strips(THERE, 0.7), _strips(NOWHERE, 0.6), _strips(HERE, 0.8)]
+    left = [_candidate(THERE, 0.7), _candidate(NOWHERE, 0.6), _candidate(HERE, 0.8)]
     ledger = _ledger((), None, left)
     assert ledger.closed().open == []
     ledger.hold(_found(HERE, 0.9, by_strips=0.8), None)
-    ledger.leave(_strips(HALF_TURN @ HERE, 0.95))
+    ledger.leave(_candidate(HALF_TURN @ HERE, 0.95))
     opened = ledger.closed().open
     assert _are([c.pose for c in opened], [HALF_TURN @ HERE, THERE])
     assert opened[0].score == 0.9
@@ -114,10 +114,10 @@ def test_of_the_candidates_that_were_not_laid_the_equals_of_the_best_are_open() 
 def test_the_others_that_explain_the_strips_are_the_rest() -> None:
     away = [Pose2(8.0, float(k), 0.0) for k in range(4)]
     ledger = _ledger((), None, [
-        _strips(THERE, 0.6), _strips(away[0], 0.6, claimed=0.9), _strips(away[3], 0.7),
-        _strips(HERE @ Pose2(0.1, 0.1, 0.0), 0.6)], [HERE, NOWHERE])
-    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _strips(HERE, 0.8, misfit=0.5))
-    ledger.pass_over(_strips(away[2], 0.6, misfit=1.5))
+        _candidate(THERE, 0.6), _candidate(away[0], 0.6, claimed=0.9), _candidate(away[3], 0.7),
+        _candidate(HERE @ Pose2(0.1, 0.1, 0.0), 0.6)], [HERE, NOWHERE])
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _candidate(HERE, 0.8, misfit=0.5))
+    ledger.pass_over(_candidate(away[2], 0.6, misfit=1.5))
     sifted = ledger.closed()
     # One leaves strips unexplained, and one is the pose that holds.
     assert _are([c.pose for c in sifted.rest], [THERE, away[2]])
@@ -128,10 +128,10 @@ def test_the_others_that_explain_the_strips_are_the_rest() -> None:
 
 def test_what_was_not_laid_lies_off_its_strips_as_the_best_does() -> None:
     moved = Pose2(0.04, -0.02, 0.01)
-    ledger = _ledger((), None, [_strips(THERE, 0.8), _strips(NOWHERE, 0.5)])
-    ledger.hold(_found(HERE @ moved, 0.9), _strips(HERE, 0.8))
+    ledger = _ledger((), None, [_candidate(THERE, 0.8), _candidate(NOWHERE, 0.5)])
+    ledger.hold(_found(HERE @ moved, 0.9), _candidate(HERE, 0.8))
     # A worse one says nothing of it.
-    ledger.hold(_found(HALF_TURN @ HERE, 0.4), _strips(HALF_TURN @ HERE, 0.4))
+    ledger.hold(_found(HALF_TURN @ HERE, 0.4), _candidate(HALF_TURN @ HERE, 0.4))
     sifted = ledger.closed()
     told = [c.pose.as_array() for c in (*sifted.open, *sifted.rest)]
     np.testing.assert_allclose(
@@ -140,17 +140,17 @@ def test_what_was_not_laid_lies_off_its_strips_as_the_best_does() -> None:
 
 def test_a_pose_is_beaten_by_what_holds_unless_more_of_it_may_be_there() -> None:
     ledger = _ledger((), None, ())
-    assert not ledger.beats(_strips(THERE, 0.1))
-    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _strips(HERE, 0.8, misfit=0.5))
+    assert not ledger.beats(_candidate(THERE, 0.1))
+    ledger.hold(_found(HERE, 0.8, by_strips=0.8), _candidate(HERE, 0.8, misfit=0.5))
     # 0.85 of 0.8, squared.
-    assert ledger.beats(_strips(THERE, 0.45)) and not ledger.beats(_strips(THERE, 0.47))
-    assert ledger.beats(_strips(THERE, 0.7, misfit=1.0))
-    assert not ledger.beats(_strips(THERE, 0.7, misfit=0.5))
+    assert ledger.beats(_candidate(THERE, 0.45)) and not ledger.beats(_candidate(THERE, 0.47))
+    assert ledger.beats(_candidate(THERE, 0.7, misfit=1.0))
+    assert not ledger.beats(_candidate(THERE, 0.7, misfit=0.5))
     plain = _ledger((), None, ())
     plain.hold(replace(_found(HERE, 0.8), alignment=SimpleNamespace(
         pose=HERE, support=np.ones(3), whole=np.arange(3), explained=1.0, missing=())), None)
-    assert plain.beats(_strips(THERE, 0.6, claimed=0.9))
-    assert not plain.beats(_strips(THERE, 0.6, claimed=0.97))
+    assert plain.beats(_candidate(THERE, 0.6, claimed=0.9))
+    assert not plain.beats(_candidate(THERE, 0.6, claimed=0.97))
 
 
 def test_a_doubtful_pose_is_open_only_beside_one_that_shows_no_more() -> None:
@@ -181,8 +181,8 @@ def test_a_pose_that_misses_lines_is_worth_no_more_than_one_that_misses_none() -
 def test_the_best_is_first_and_tied_by_its_equals() -> None:
     ledger = _ledger((), None, ())
     assert not ledger.is_tied()
-    ledger.hold(_found(HERE, 0.7), _strips(HERE, 0.8, misfit=0.4))
-    ledger.hold(_found(THERE, 0.9), _strips(THERE, 0.8, misfit=0.2))
+    ledger.hold(_found(HERE, 0.7), _candidate(HERE, 0.8, misfit=0.4))
+    ledger.hold(_found(THERE, 0.9), _candidate(THERE, 0.8, misfit=0.2))
     assert ledger.best is not None and ledger.best.alignment.pose == THERE
     assert not ledger.is_tied()
     ledger.hold(_found(NOWHERE, 0.8), None)
@@ -193,7 +193,7 @@ def test_the_best_is_first_and_tied_by_its_equals() -> None:
 def test_what_something_hides_is_hidden_with_its_twins() -> None:
     ledger = _ledger((HALF_TURN,), None, ())
     ledger.hide(AWAY, _found(HERE, 0.5, by_strips=0.6))
-    ledger.rule_out(_strips(THERE, 0.4), AWAY)
+    ledger.rule_out(_candidate(THERE, 0.4), AWAY)
     sifted = ledger.closed()
     assert [(c.pose, c.score) for c in sifted.hidden] == [
         (HERE, 0.6), (HALF_TURN @ HERE, 0.6), (THERE, 0.4)]
@@ -231,6 +231,6 @@ def test_nothing_holds_where_the_image_shows_more_of_a_pose_that_it_speaks_again
 def test_a_look_is_promising_where_no_other_pose_rivals_the_best(
     shown: tuple[tuple[float, float], ...], promising: bool,
 ) -> None:
-    candidates = tuple(_strips(HERE, *of) for of in shown)
+    candidates = tuple(_candidate(HERE, *of) for of in shown)
     sight = Sight(np.zeros((1, 1, 3), np.uint8), (), candidates, Poses.of(()), ())
     assert sight.is_promising == promising

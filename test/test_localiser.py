@@ -34,6 +34,7 @@ import nccs_pose.estimation.localiser as localiser_module
 from nccs_pose.estimation.localiser import Localiser
 from nccs_pose.estimation.many_poses import same_pose
 from nccs_pose.estimation.measuring import Look, Measurer
+from nccs_pose.estimation.misplaced import LineFinder
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.search import Searcher
@@ -350,12 +351,12 @@ def test_what_was_refused_at_one_look_is_not_laid_at_the_next(
 
     monkeypatch.setattr(Aligner, 'align', missing)
 
-    def twice(*place: Any) -> Iterator[Sight]:
-        for sight in look(*place):
+    def twice(*place: Any, **how: Any) -> Iterator[Sight]:
+        for sight in look(*place, **how):
             yield from (sight, sight)
 
-    def with_its_like(*place: Any) -> Iterator[Sight]:
-        for sight in look(*place):
+    def with_its_like(*place: Any, **how: Any) -> Iterator[Sight]:
+        for sight in look(*place, **how):
             yield from (sight, replace(sight))
 
     for sights in (look, twice, with_its_like):
@@ -564,8 +565,9 @@ def test_what_leaves_a_pose_open_is_not_gone_into(monkeypatch: pytest.MonkeyPatc
         laid=drive.pose @ Pose2(0.3, 0.0, 0.0)) is None
     # Nor would any line that should be seen there.
     judge = Judge(
-        Searcher(table, RAILS, options), aligner.predictor, table, RAILS, options)
-    against = judge.found(image, alignment, (), LineHistory(), expected=False, strips=None)
+        Searcher(table, RAILS, options), LineFinder(aligner.predictor, table, RAILS, options),
+        RAILS, options)
+    against = judge.found(image, alignment, (), LineHistory(), expected=False, candidate=None)
     assert isinstance(against, Objection) and not judge.may_miss(alignment, against)
     seen = replace(alignment, support=np.array([1.0, 1.0, 0.0, np.nan]))
     assert judge.may_miss(seen, against)

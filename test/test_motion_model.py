@@ -354,14 +354,14 @@ def test_a_direction_out_of_sight_grows_uncertain_since_it_was_last_seen() -> No
     assert by_velocity((before,), unseen, SECOND + SECOND // 10) is None
 
 
-def test_the_floor_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
+def test_the_inflation_of_a_prediction_is_taken_out_where_the_image_says_nothing() -> None:
     """Against the solution of both problems written out: x observed, y not."""
     carried = np.diag([0.03, 0.05, 0.01]) ** 2
     prediction = Prediction(START, carried, True)
     image = np.diag([1.0 / 0.001**2, 0.0, 1.0 / 0.002**2])
     solved = np.linalg.inv(image + np.linalg.inv(prediction.covariance))
     for multiple in (1.0, 4.0):
-        got = prediction.without_floor(multiple * solved, solved)
+        got = prediction.without_inflation(multiple * solved, solved)
         assert np.sqrt(got[1, 1]) == pytest.approx(0.05, rel=1e-9)
         # What the image sees keeps its own uncertainty: never less for having a good prediction.
         assert np.sqrt(got[0, 0]) == pytest.approx(np.sqrt(multiple) * 0.001, rel=0.01)
@@ -512,8 +512,8 @@ def test_a_robot_that_is_carried_away_does_not_speak_against_its_wheels() -> Non
     new = Course().after(0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
     for course in (_held_against_images(), new):
         last = course.last
-        assert last is not None and last.odometry is not None
-        wheels = Wheels(last.odometry.pose @ Pose2(0.2, 0.0, 0.0), last.odometry.way + 0.2)
+        assert last is not None and last.wheels is not None
+        wheels = Wheels(last.wheels.pose @ Pose2(0.2, 0.0, 0.0), last.wheels.way + 0.2)
         elsewhere = last.pose @ Pose2(-1.5, 0.0, 0.0)
         after = course.after(
             last.stamp_ns + SECOND, elsewhere, 1e-6 * np.eye(3), wheels, is_fixed=True)
@@ -524,10 +524,10 @@ def test_a_robot_that_is_carried_away_does_not_speak_against_its_wheels() -> Non
 def test_what_wheels_erred_by_once_is_forgotten_on_the_way() -> None:
     course = _held_against_images(1.2)
     last = course.last
-    assert last is not None and last.odometry is not None
+    assert last is not None and last.wheels is not None
     for k in range(1, 61):
         step = Pose2(0.1 * k, 0.0, 0.0)
-        wheels = Wheels(last.odometry.pose @ step, last.odometry.way + 0.1 * k)
+        wheels = Wheels(last.wheels.pose @ step, last.wheels.way + 0.1 * k)
         course = course.after(
             last.stamp_ns + k * SECOND // 10, last.pose @ step, 1e-6 * np.eye(3), wheels,
             is_fixed=True)

@@ -22,7 +22,7 @@ from typing import Any
 
 from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import weigh_shifts
+from nccs_pose.estimation.shift_solve import Prior, weigh_shifts
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform
@@ -245,7 +245,7 @@ def test_a_prior_decides_what_the_stations_leave_open(slide: np.ndarray) -> None
     covariance = np.diag([1.0, 0.04, 0.01])
     found = _solved(
         np.full(len(slide), 3.0), np.full(len(slide), 0.05), blind, *_each(len(slide)), POSE,
-        prior=(Pose2(0.3, 0.1, 0.5), np.linalg.inv(covariance)))
+        prior=Prior(Pose2(0.3, 0.1, 0.5), np.linalg.inv(covariance)))
     np.testing.assert_allclose(found.pose.as_array(), [0.31, 0.1, 0.5], atol=1e-3)
     np.testing.assert_allclose(np.diag(found.covariance)[1:], [0.04, 0.01], rtol=1e-2)
 
@@ -257,9 +257,7 @@ def test_what_the_calibration_shifts_no_number_of_stations_averages_out(
     # Far below the noise told, all weights are one.
     shift = 0.0001 * np.random.default_rng(6).standard_normal(len(slide))
     sigma = np.full(len(slide), 0.001)
-    found = _solved(
-        shift, sigma, slide, *_each(len(slide)), POSE, image_shift=across,
-        calibration_sigma=0.1)
+    found = _solved(shift, sigma, slide, *_each(len(slide)), POSE, image_sigma=0.1 * across)
     # A shift of the image by (u, v) moves the pose by -G (u, v), G from least squares.
     moved = np.linalg.lstsq(slide[:, :3], across, rcond=None)[0]
     expected = 0.01 * moved @ moved.T

@@ -24,6 +24,7 @@ from nccs_pose.calibration.sensitivity import EdgeLines
 from nccs_pose.errors import EstimationError
 from nccs_pose.estimation.refine import refine
 from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.vision.median import SIGMA_PER_MEDIAN
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,9 +66,9 @@ class Judgement:
 
 
 def robust_deviation(residual: Array) -> float:
-    """1.4826 times the median absolute value of what is finite; NaN of nothing."""
+    """Standard deviation about zero of what is finite, by its median; NaN of nothing."""
     finite = np.abs(residual[np.isfinite(residual)])
-    return 1.4826 * float(np.median(finite)) if len(finite) else float('nan')
+    return SIGMA_PER_MEDIAN * float(np.median(finite)) if len(finite) else float('nan')
 
 
 def judge(

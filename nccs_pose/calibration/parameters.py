@@ -35,7 +35,7 @@ from nccs_pose.calibration.sensitivity import Sensitivity
 from nccs_pose.errors import CalibrationError
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.mirror import QuadricMirror
-from nccs_pose.geometry.pose import Array, RigidTransform, rotation_exp
+from nccs_pose.geometry.pose import Array, cross_matrix, RigidTransform, rotation_exp
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import NDArray
@@ -191,8 +191,7 @@ class RigParameters:
 def left_jacobian(vector: Array) -> Array:
     """J (3, 3) with exp(v + dv) = exp(J dv) exp(v), to first order."""
     angle = float(np.linalg.norm(vector))
-    k = np.array([
-        [0.0, -vector[2], vector[1]], [vector[2], 0.0, -vector[0]], [-vector[1], vector[0], 0.0]])
+    k = cross_matrix(vector)
     if angle < 1e-4:
         return np.eye(3) + 0.5 * k + k @ k / 6.0
     return (np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * k

@@ -24,6 +24,7 @@ from nccs_pose.estimation.alignment import Alignment, close, leaves_open, Pass
 from nccs_pose.estimation.measuring import LEAST_STATIONS, LINEAR_PX, Measurer
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -40,10 +41,12 @@ SPACING = 2.0
 _CHOSEN_APART = (0.25, 0.4)
 _REMEMBERED = 4
 # Where the image is sharp, so that a tape is found from nearby only, or the start is a little off,
-# a first, rough pass takes one station in four. Where more curve than this is in view, px, these
-# few show what tapes look like as well, and a second pass takes one in two.
-_SOME = (4, 2)
+# a first, rough pass takes one station in so many.
+_FEW = 4
+# Where more curve than this is in view, px, these few show what tapes look like as well, and a
+# second pass takes one in so many.
 _LONG = 2000.0
+_MORE = 2
 # A start that should be off by LINEAR_PX at most, but is moved by more than this, px, in its first
 # pass is nowhere near.
 _ASTRAY_PX = 5.0
@@ -123,7 +126,7 @@ class Aligner:
         colours: tuple[LineColour, ...],
         *,
         reach: float = 0.0,
-        prior: tuple[Pose2, Array] | None = None,
+        prior: Prior | None = None,
         hopeless: Callable[[Alignment], bool] | None = None,
         laid: Pose2 | None = None,
     ) -> Alignment | None:
@@ -132,8 +135,7 @@ class Aligner:
         :param image: (H, W, 3) uint8 BGR.
         :param reach: how far off the start may be, px. Beyond two pixels bands of this half width
             are searched first; 0 is for a start that is most likely right.
-        :param prior: a pose with its information (3, 3): carries the directions that the lines in
-            view do not fix.
+        :param prior: carries the directions that the lines in view do not fix.
         :param hopeless: says of a pose that has nearly settled whether it is refused in any case.
             If so it is given as it is, which saves the last passes; so is one of which the lines
             leave a direction open.
@@ -153,18 +155,19 @@ class Aligner:
             return None
         begun = self._begun(image, places, _State(pose, np.zeros(3), colours), prior, reach)
         return None if begun is None else self._settled(
-            image, places, begun, prior, reach, hopeless)
+            image, places, begun, prior, followed=reach == 0.0, hopeless=hopeless)
 
     def _settled(
-        self, image: NDArray[np.uint8], places: Places, state: _State,
-        prior: tuple[Pose2, Array] | None, reach: float,
-        hopeless: Callable[[Alignment], bool] | None,
+        self, image: NDArray[np.uint8], places: Places, state: _State, prior: Prior | None, *,
+        followed: bool, hopeless: Callable[[Alignment], bool] | None,
     ) -> Alignment | None:
         """Pass over an image until the pose moves no more, or will be refused in any case.
 
         :param places: where the stations stand to begin with.
+        :param followed: whether the start is most likely right: one pass may do.
+        :param hopeless: as of :meth:`align`.
         """
-        followed, before = reach == 0.0, state.pose
+        before = state.pose
         for k in range(_ITERATIONS):
             look = self._measurer.look(image, places, state.pose, state.attitude, state.colours)
             if look is None:
@@ -224,7 +227,7 @@ class Aligner:
         return self._places(Pose2(metres * column, metres * row, radians * turn))
 
     def _searched(
-        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        self, image: NDArray[np.uint8], start: Pose2, prior: Prior | None,
         colours: tuple[LineColour, ...], reach: float, laid: Pose2 | None,
     ) -> Pose2 | None:
         """Where a search across the bands leads; None where to nothing, or to nothing new."""
@@ -239,8 +242,8 @@ class Aligner:
         return searched.pose
 
     def _begun(
-        self, image: NDArray[np.uint8], places: Places, start: _State,
-        prior: tuple[Pose2, Array] | None, reach: float,
+        self, image: NDArray[np.uint8], places: Places, start: _State, prior: Prior | None,
+        reach: float,
     ) -> _State | None:
         """What to go on from with all stations.
 
@@ -249,11 +252,15 @@ class Aligner:
         """
         inexact = _sharpest(start.colours) < ROUGH_BLUR or 0.0 < reach <= LINEAR_PX
         long = reach > 0.0 and places.length > _LONG
-        if not (inexact or long) or len(places) < _SOME[0] * LEAST_STATIONS:
+        if not (inexact or long) or len(places) < _FEW * LEAST_STATIONS:
             return start
         followed, state = reach == 0.0, start
-        # A robot that is followed may be so far off that it takes two.
-        for k, step in enumerate(_SOME[:1] * 2 if followed else _SOME[:1 + long]):
+        if followed:
+            # It may be so far off that it takes two.
+            steps: tuple[int, ...] = (_FEW, _FEW)
+        else:
+            steps = (_FEW, _MORE) if long else (_FEW,)
+        for k, step in enumerate(steps):
             sharpest = _sharpest(state.colours)
             look = self._measurer.look(
                 image, places.every(step), state.pose, state.attitude, state.colours,

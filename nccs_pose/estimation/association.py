@@ -28,12 +28,12 @@ from typing import NamedTuple
 from nccs_pose.estimation.estimate import Candidate
 from nccs_pose.estimation.floor_points import footprints, half_strip
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.many_poses import distinct, one_of_each, Poses, unlike
 from nccs_pose.estimation.nearest_lines import NearestLines
 from nccs_pose.estimation.strip_pairs import FloorLines, poses_of_pairs
 from nccs_pose.estimation.strip_scores import SeenMap, StripScorer
 from nccs_pose.estimation.symmetries import map_symmetries
-from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import as_points, Complex, FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -53,7 +53,7 @@ _ASKEW = 0.15
 _MUCH = 0.85
 # A pose that explains this part of the strips leaves none unexplained.
 ALL_STRIPS = 0.95
-_NONE = Poses(np.zeros(0, complex), np.zeros(0, complex))
+_NONE = Poses.of(())
 
 
 @dataclass(frozen=True)
@@ -103,26 +103,26 @@ class Associator:
         self._last: StripScorer | None = None
 
     def candidates(
-        self, segments: tuple[FloorSegment, ...], told: Told | None = None,
+        self, segments: tuple[FloorSegment, ...], gate: Gate | None = None,
     ) -> Candidates:
         """Poses that explain strips; none where fewer than two strips cross.
 
         The best few are laid on the strips by least squares; where a map has many places alike
         the others follow as they were guessed, with what they score there.
 
-        :param told: where the robot is by something else; poses there are not left out for others
+        :param gate: where the robot is by something else; poses inside are not left out for others
             that explain as much.
         """
         if len(segments) < 2:
             return Candidates((), _NONE)
         scorer = self._scorer(segments)
-        poses = Poses(*poses_of_pairs(scorer.strips, self._joined, _PAIRS))
-        if len(poses.place) == 0:
+        poses = poses_of_pairs(scorer.strips, self._joined, _PAIRS)
+        if not len(poses):
             return Candidates((), _NONE)
         guessed: list[FittedCandidate] = []
         others = _NONE
-        if len(poses.place) > _REFINED:
-            poses, guessed, others = _promising(scorer, poses, told)
+        if len(poses) > _REFINED:
+            poses, guessed, others = _promising(scorer, poses, gate)
             poses, claimed, misfit = scorer.refined(poses, 1)
         else:
             poses, claimed, misfit = scorer.refined(poses, 2)
@@ -141,7 +141,7 @@ class Associator:
             return []
         scorer = self._scorer(segments)
         places = Poses.of([likeness @ pose for likeness in self._likenesses])
-        return [*_fitted(scorer, places, scorer.claimed(places), np.zeros(len(places.place))),
+        return [*_fitted(scorer, places, scorer.claimed(places), np.zeros(len(places))),
                 *_fitted(scorer, *scorer.refined(places, 2))]
 
     def score(self, pose: Pose2, segments: tuple[FloorSegment, ...]) -> tuple[float, float]:
@@ -190,8 +190,8 @@ def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
         np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
         line.length, _ASKEW, np.zeros((0, 2)), line.colour) for line in line_map)
     scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), seen)
-    poses = Poses(*poses_of_pairs(scorer.strips, seen.lines, _PAIRS))
-    if not 0 < len(poses.place) <= _CLOSE:
+    poses = poses_of_pairs(scorer.strips, seen.lines, _PAIRS)
+    if not 0 < len(poses) <= _CLOSE:
         return ()
     poses, claimed, _ = scorer.refined(poses, 4)
     poses = poses[[k for k in distinct(poses, claimed) if claimed[k] > _MUCH]]
@@ -199,15 +199,15 @@ def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
 
 
 def _promising(
-    scorer: StripScorer, poses: Poses, told: Told | None,
+    scorer: StripScorer, poses: Poses, gate: Gate | None,
 ) -> tuple[Poses, list[FittedCandidate], Poses]:
     """Of many poses those that are worth refining, and others that show as much.
 
     :returns: those, others that were looked at, and others that leave no strip unexplained.
     """
     claimed = scorer.claimed(poses, _COARSE)
-    there = np.zeros(len(claimed), dtype=bool) if told is None else (
-        told.holds_guesses(poses.place, poses.rotation))
+    there = np.zeros(len(claimed), dtype=bool) if gate is None else (
+        gate.contains_each(poses))
     best = np.lexsort([-claimed, ~there])
     if len(best) > _CLOSE:
         best = one_of_each(poses, best)
@@ -219,10 +219,8 @@ def _promising(
     there = there[best]
     score = _harmonic(claimed, scorer.explained(poses, _COARSE))
     found = sorted(distinct(poses, score), key=lambda k: not there[k])
-    guessed = found[_REFINED:]
-    return poses[found[:_REFINED]], [FittedCandidate(*of) for of in zip(
-        poses[guessed].listed(),
-        *(part[guessed].tolist() for part in (score, claimed, misfit)))], others
+    return poses[found[:_REFINED]], _listed(
+        poses, score, claimed, misfit, found[_REFINED:]), others
 
 
 def _fitted(
@@ -230,9 +228,15 @@ def _fitted(
 ) -> list[FittedCandidate]:
     """Poses and what is known of them, as of :meth:`.StripScorer.refined`; one of each."""
     score = _harmonic(claimed, scorer.explained(poses))
-    found = distinct(poses, score)
+    return _listed(poses, score, claimed, misfit, distinct(poses, score))
+
+
+def _listed(
+    poses: Poses, score: Array, claimed: Array, misfit: Array, which: list[int],
+) -> list[FittedCandidate]:
+    """Some of H poses, each with what is known of it (H,)."""
     return [FittedCandidate(*of) for of in zip(
-        poses[found].listed(), *(part[found].tolist() for part in (score, claimed, misfit)))]
+        poses[which].listed(), *(part[which].tolist() for part in (score, claimed, misfit)))]
 
 
 def _harmonic(a: Array, b: Array) -> Array:

@@ -19,13 +19,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from nccs_pose.estimation.aligner import LINEAR_PX
 from nccs_pose.estimation.association import FittedCandidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
+from nccs_pose.estimation.measuring import LINEAR_PX
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.sights import Sight
-from nccs_pose.estimation.told import Told
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
 
@@ -41,12 +41,12 @@ class Start:
     """A pose to lay on an image.
 
     :ivar reach: how far it may be off in the image, px.
-    :ivar strips: what they say of it; None if it has to be tried in any case.
+    :ivar candidate: what the strips say of it; None if it has to be tried in any case.
     """
 
     pose: Pose2
     reach: float
-    strips: FittedCandidate | None = None
+    candidate: FittedCandidate | None = None
 
     @classmethod
     def of(cls, candidate: FittedCandidate) -> Start:
@@ -56,7 +56,7 @@ class Start:
     @property
     def misfit(self) -> float:
         """How far the strips lie off its lines, px."""
-        return 0.0 if self.strips is None else self.strips.misfit
+        return 0.0 if self.candidate is None else self.candidate.misfit
 
     @property
     def reaches(self) -> tuple[float, ...]:
@@ -65,7 +65,7 @@ class Start:
 
     def kept(self, pose: Pose2) -> FittedCandidate | None:
         """What the strips say of the pose that it became on the image; None where that is new."""
-        return self.strips if self.is_at(pose) else None
+        return self.candidate if self.is_at(pose) else None
 
     def is_at(self, pose: Pose2) -> bool:
         """Whether the strips lie on a pose as they do on this."""
@@ -80,7 +80,7 @@ class Case:
     :ivar sight: what the look shows.
     :ivar history: what images have said of the lines before.
     :ivar prediction: of the pose, if there is one.
-    :ivar told: where the robot is by something else than the image, which can decide between
+    :ivar gate: where the robot is by something else than the image, which can decide between
         equal poses: those that are there come first. Without it two equal poses are enough to
         know that the image does not decide, and no more are laid on it.
     :ivar before: what came of other looks at the same image.
@@ -89,7 +89,7 @@ class Case:
     sight: Sight
     history: LineHistory
     prediction: Prediction | None
-    told: Told | None
+    gate: Gate | None
     before: Mapping[Sight, Sifted]
 
     @property

@@ -50,10 +50,10 @@ class Course:
         last = self.last
         if last is None:
             return None
-        if last.odometry is not None and wheels is not None:
+        if last.wheels is not None and wheels is not None:
             flaw = self.errors.flaw.doubted() if doubted else self.errors.flaw
             return by_odometry(
-                last.pose, last.covariance, last.odometry, wheels, last.seen_way, flaw)
+                last.pose, last.covariance, last.wheels, wheels, last.seen_way, flaw)
         return by_velocity(self.past, last, stamp_ns)
 
     def seconds_to(self, stamp_ns: int) -> float:
@@ -92,4 +92,4 @@ class Course:
     def without_odometry(self) -> Course:
         """The course once the wheels' reckoning has broken off: no step leads on from there."""
         return self if self.last is None else replace(
-            self, last=replace(self.last, odometry=None), errors=self.errors.begun_at(None))
+            self, last=replace(self.last, wheels=None), errors=self.errors.begun_at(None))

@@ -19,12 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.gate import BETTER, Gate
 from nccs_pose.estimation.hypotheses import confronted, Hypothesis
 from nccs_pose.estimation.judge import Found, is_expected
 from nccs_pose.estimation.ledger import Sifted
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.told import BETTER, Told
 from nccs_pose.estimation.verdict import lines_used
 
 # Of the poses among which an image does not decide so many are laid on the next; on a map with
@@ -33,54 +33,51 @@ _CARRIED = 8
 
 
 def the_one_expected(
-    held: Sequence[Found], sifted: Sifted, told: Told | None,
-    prediction: Prediction | None, options: LocaliserOptions,
+    sifted: Sifted, gate: Gate | None, prediction: Prediction | None, options: LocaliserOptions,
 ) -> Found | None:
     """The one pose that a prior or a prediction expects, if it is one of the best of all.
 
-    :param held: the poses that explain the image, best first.
-    :param sifted: what else the search of it left.
-    :param told: where the prediction, or without one a prior, says that the robot is.
+    :param sifted: what the search of the image left; some pose explains it.
+    :param gate: about the prediction or, without one, a prior.
     """
-    if told is None:
+    if gate is None:
         return None
-    near = [f for f in held if (
-        told.holds(f.alignment.pose, f.alignment.covariance) if prediction is None
+    near = [f for f in sifted.held if (
+        gate.contains(f.alignment.pose, f.alignment.covariance) if prediction is None
         else is_expected(f.alignment, prediction, options.innovation_gate))]
-    if not near or _leaves_any(told, sifted):
+    if not near or _leaves_any(gate, sifted):
         return None
     best, ratio = near[0], options.ambiguity_ratio
-    if best.score + BETTER < held[0].score or any(
+    if best.score + BETTER < sifted.held[0].score or any(
             f.score >= ratio * best.score for f in near[1:]):
         return None
     return best
 
 
-def may_show(told: Told, held: Sequence[Found], sifted: Sifted) -> bool:
-    """Whether an image may show a pose where it is told.
+def may_show(gate: Gate, sifted: Sifted) -> bool:
+    """Whether an image may show a pose inside a gate.
 
-    :param held: the poses that explain it.
-    :param sifted: what else the search of it left.
+    :param sifted: what the search of it left.
     """
-    return any(told.holds(f.alignment.pose) for f in held) or _leaves_any(told, sifted)
+    return any(gate.contains(f.alignment.pose) for f in sifted.held) or _leaves_any(gate, sifted)
 
 
-def _leaves_any(told: Told, sifted: Sifted) -> bool:
-    """Whether there is a pose where it is told that was not laid on the image."""
-    return any(told.holds(c.pose) for c in (*sifted.open, *sifted.rest)) or bool(
-        told.holds_guesses(sifted.others.place, sifted.others.rotation).any())
+def _leaves_any(gate: Gate, sifted: Sifted) -> bool:
+    """Whether there is a pose inside the gate that was not laid on the image."""
+    return any(gate.contains(c.pose) for c in (*sifted.open, *sifted.rest)) or bool(
+        gate.contains_each(sifted.others).any())
 
 
 def left_open(
-    hypotheses: Sequence[Hypothesis], held: Sequence[Found], sifted: Sifted,
+    hypotheses: Sequence[Hypothesis], sifted: Sifted,
 ) -> tuple[tuple[Hypothesis, ...], list[Candidate]]:
     """The poses among which an image has not decided, and the next one may.
 
     :param hypotheses: those that were open before it.
-    :param held: the poses that explain it, best first.
-    :param sifted: what else the search of it left.
+    :param sifted: what the search of it left; some pose explains it.
     :returns: those to be laid on the next image, and others that may be right as well.
     """
+    held = sifted.held
     best, *others = confronted(hypotheses, [(f.alignment.pose, f.score) for f in held])
     # Scores of what is left open are of this image, as parts of its best; those of hypotheses are
     # means over several.
@@ -94,7 +91,7 @@ def left_open(
         carried_on += tuple(Hypothesis(c.pose, (c.score,)) for c in sifted.hidden)
     more = [h.candidate for h in others[most:]]
     more += [Candidate(c.pose, before * c.score) for c in (*sifted.open[most:], *sifted.rest)]
-    if len(sifted.others.place) > 0:
+    if len(sifted.others):
         # They show no more than the least of what was looked at closely, for all that is known.
         least = min([*(h.mean for h in (best, *others)), *(c.score for c in more)])
         more += [Candidate(pose, least) for pose in sifted.others.listed()]

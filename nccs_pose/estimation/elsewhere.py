@@ -22,14 +22,15 @@ from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment, leaves_open
 from nccs_pose.estimation.association import Candidates
 from nccs_pose.estimation.case import SEARCH_BAND
+from nccs_pose.estimation.gate import BETTER, Gate
 from nccs_pose.estimation.judge import fit_of
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
 from nccs_pose.estimation.motion import Prediction
-from nccs_pose.estimation.observability import COINCIDENT
+from nccs_pose.estimation.observability import parallel_to
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher, Strips
-from nccs_pose.estimation.told import BETTER, Told
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.estimation.verdict import contradiction, is_suspect, Objection
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
@@ -45,10 +46,18 @@ _TRIED = 4
 _GATE = 3.0
 # Lines lie better elsewhere if they explain so much more there, counting how well they lie.
 _FITS_BETTER = 0.05
-FITS_ELSEWHERE = Objection('its lines lie better on another pose')
-"""What is said against an expected pose that may be another one of a map nearly symmetric."""
+_FITS_ELSEWHERE = Objection('its lines lie better on another pose')
 _ANOTHER = Objection('another pose explains the image better')
 _AS_WELL = Objection('another place where the robot may be by now explains the image as well')
+
+
+def leaves_room(alignment: Alignment, claimed: float) -> bool:
+    """Whether a pose leaves so much unexplained that another could explain more.
+
+    :param claimed: fraction of the line-coloured pixels that lie on its lines.
+    """
+    # No score exceeds 1.
+    return bool(alignment.missing) or min(claimed, alignment.explained) + BETTER < 1.0
 
 
 class Elsewhere:
@@ -61,14 +70,6 @@ class Elsewhere:
         self._searcher = searcher
         self._map = line_map
         self._options = options
-
-    def leaves_room(self, alignment: Alignment, claimed: float) -> bool:
-        """Whether a pose leaves so much unexplained that another could explain more.
-
-        :param claimed: fraction of the line-coloured pixels that lie on its lines.
-        """
-        # No score exceeds 1.
-        return bool(alignment.missing) or min(claimed, alignment.explained) + BETTER < 1.0
 
     def refused(
         self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction,
@@ -87,20 +88,20 @@ class Elsewhere:
             return Refused(against, alignment)
         if is_suspect(alignment) and self._fits_better(image, alignment, segments):
             # Without the alignment, which others would have to beat by what they explain.
-            return Refused(FITS_ELSEWHERE)
+            return Refused(_FITS_ELSEWHERE, misled=True)
         vague = prediction.is_vague
         here, _ = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
             return None
-        gate = min(_GATE, self._options.innovation_gate)
-        told = Told(prediction.pose, prediction.covariance, gate)
-        found = self._searcher.candidates(segments, told if vague else None)
+        sigmas = min(_GATE, self._options.innovation_gate)
+        gate = Gate(prediction.pose, prediction.covariance, sigmas)
+        found = self._searcher.candidates(segments, gate if vague else None)
         best = found.fitted[0] if found.fitted else None
         if best is not None and best.score > here + BETTER and not same_pose(
                 best.pose, alignment.pose):
             return Refused(_ANOTHER, alignment)
-        if vague and (self._shows_as_much(found, alignment, here, told)
-                      or self._is_one_of_parallels(image, alignment, prediction, told)):
+        if vague and (self._shows_as_much(found, alignment, here, gate)
+                      or self._is_one_of_parallels(image, alignment, prediction, gate)):
             # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
@@ -109,30 +110,30 @@ class Elsewhere:
         self, image: NDArray[np.uint8], alignment: Alignment, segments: Strips,
     ) -> bool:
         """Whether the lines lie better on a place from where the map looks nearly the same."""
-        here = alignment.explained * fit_of(alignment.points.variance)
+        here = _worth(alignment)
         for place in self._searcher.taken_for(alignment.pose, segments):
             other = self._aligner.align(
                 image, place.pose, alignment.colours, reach=SEARCH_BAND)
             if other is None or same_pose(other.pose, alignment.pose):
                 continue
-            if other.explained * fit_of(other.points.variance) > here + _FITS_BETTER:
+            if _worth(other) > here + _FITS_BETTER:
                 return True
         return False
 
     def _shows_as_much(
-        self, found: Candidates, alignment: Alignment, here: float, told: Told,
+        self, found: Candidates, alignment: Alignment, here: float, gate: Gate,
     ) -> bool:
-        """Whether strips show as much of another pose where it is told."""
+        """Whether strips show as much of another pose inside the gate."""
         least = self._options.ambiguity_ratio * here
         others = found.others[unlike(found.others, Poses.of([alignment.pose]))]
-        return bool(told.holds_guesses(others.place, others.rotation).any()) or any(
-            c.score >= least and told.holds(c.pose) and not same_pose(c.pose, alignment.pose)
+        return bool(gate.contains_each(others).any()) or any(
+            c.score >= least and gate.contains(c.pose) and not same_pose(c.pose, alignment.pose)
             for c in found.fitted)
 
     def _is_one_of_parallels(
-        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction, told: Told,
+        self, image: NDArray[np.uint8], alignment: Alignment, prediction: Prediction, gate: Gate,
     ) -> bool:
-        """Whether a pose on parallel lines alone lies as well on others where it is told.
+        """Whether a pose on parallel lines alone lies as well on others inside the gate.
 
         These fix no pose, so that no search of the whole image finds them.
         """
@@ -141,21 +142,26 @@ class Elsewhere:
         least = self._options.ambiguity_ratio * alignment.explained
         places = (Pose2(alignment.pose.x + x, alignment.pose.y + y, alignment.pose.yaw)
                   for x, y in self._steps_across(alignment.lines[0]).tolist())
-        for pose in islice(filter(told.holds, places), _TRIED):
+        for pose in islice(filter(gate.contains, places), _TRIED):
             other = self._aligner.align(
                 image, pose, alignment.colours, reach=self._options.band,
-                prior=(pose, prediction.information))
+                prior=Prior(pose, prediction.information))
             if other is not None and other.explained >= least:
                 return True
         return False
 
     def _steps_across(self, line: int) -> Array:
         """What lays a map's lines on parallel ones of their colour (K, 2), metres, least first."""
-        x, y, _ = self._map.directions.T
-        normal = np.array([-y[line], x[line]])
-        parallel = np.abs(x * y[line] - y * x[line]) < COINCIDENT
+        direction = self._map.directions[line]
+        normal = np.array([-direction[1], direction[0]])
+        parallel = parallel_to(direction, self._map.directions)
         parallel &= np.array([other.colour == self._map[line].colour for other in self._map])
         across = self._map.starts[parallel, :2] @ normal
         steps = np.unique(np.round((across[:, None] - across) / _APART)) * _APART
         steps = steps[steps != 0.0]
         return steps[np.argsort(np.abs(steps)), None] * normal
+
+
+def _worth(alignment: Alignment) -> float:
+    """How much a pose explains of what should be seen, counting how well its lines lie."""
+    return alignment.explained * fit_of(alignment.points.variance)

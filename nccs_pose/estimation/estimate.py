@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 import math
-from typing import Protocol
+from typing import Literal, Protocol
 
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.vision.line_points import LinePoints
@@ -113,6 +113,9 @@ class Quality:
     claimed: float = math.nan
     ambiguity: float = math.nan
     unobserved: tuple[str, ...] = ()
+
+
+Stage = Literal['predict', 'detect', 'associate', 'measure', 'refine']
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,11 @@ from numpy.typing import NDArray
 # A pixel belongs to a strip if it is no further off than this part of its own footprint beyond
 # the tape's half width.
 _FOOTPRINT = 0.75
+# A point of a tape may lie so much further from its midline than half its width, metres.
+_SPARE = 0.005
+# Where in a tape's width a point lies is as unsure as this part of the width's square; if spread
+# evenly over it 1/12.
+_SPREAD = 0.1
 # Points are compared with lines in blocks of so many.
 _BLOCK = 256
 
@@ -118,7 +123,7 @@ class PixelFloor:
         floor = np.ones((len(found), 3))
         floor[:, :2] = found[:, :2]
         spread = found[:, 2:]
-        precision = 1.0 / (spread[:, 0] + spread[:, 2] + 0.1 * width**2)
+        precision = 1.0 / (spread[:, 0] + spread[:, 2] + _SPREAD * width**2)
         return FloorPoints(
             floor, spread, precision, segmentation.label, segmentation.weight, segmentation.pitch)
 
@@ -199,7 +204,7 @@ def half_strip(width: float, footprint: Array) -> Array:
 
 def _half(width: float) -> float:
     """How far from a tape's midline a point of its floor may be, metres."""
-    return 0.5 * width + 0.005
+    return 0.5 * width + _SPARE
 
 
 def principal_lines(moments: Array) -> tuple[Array, Array, Array]:

@@ -77,6 +77,9 @@ _MOST_PIXELS = 2000
 # The mean square distance from its middle is a third of the square of half of its width where a
 # strip is full, and more at a corner.
 _STRAIGHT = 0.5
+# A strip lies on a line of the map no further off than this, metres, beyond so many footprints.
+_ON = 0.06
+_ON_FOOTPRINTS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,11 @@ class FloorSegment:
     colour: str = 'green'
     pitch: int = 1
 
+    @property
+    def tolerance(self) -> float:
+        """How far off a line of the map it may be and still lies on it, metres."""
+        return _ON + _ON_FOOTPRINTS * self.footprint
+
 
 def floor_segments(
     segmentation: Segmentation, floor: PixelFloor, width: float, colour: str,
@@ -127,28 +135,17 @@ def floor_segments(
     share = np.bincount(label) / np.maximum(np.bincount(label[kept], minlength=label[-1] + 1), 1)
     points = points[kept]
     points = replace(points, weight=points.weight * share[points.blob])
-    near = points.near(normals, offsets, width)
-    free = np.ones(len(points.floor), dtype=bool)
-    # Of each point what it counts, and one; and of each line what its free points do.
-    counts = np.array([points.weight, free], np.float32)
-    support, starts = (counts @ near).astype(float)
+    starts = _Starts(points, normals, offsets, width)
     segments: list[FloorSegment] = []
     while len(segments) < _MOST_STRIPS:
-        support[starts < _LEAST_START] = -np.inf
-        best = int(support.argmax())
-        if support[best] < _LEAST_PIXELS:
+        best = starts.heaviest()
+        if best is None:
             break
-        start, = ((near[:, best] > 0.0) & free).nonzero()
-        strip = _strip(points, free, start, width)
+        along_it = starts.free_along(best)
+        strip = _strip(points, starts.free, along_it, width)
         if strip is None or strip.length < _LEAST_LENGTH:
-            # Nor does any line run on that starts from nearly the same points, or from points of
-            # a thing so short alone.
-            common = near[start].sum(axis=0)
-            support[common >= _ALIKE * np.maximum(starts, len(start))] = -np.inf
-            if strip is not None:
-                support[starts == near[strip.inside].sum(axis=0)] = -np.inf
+            starts.drop_like(along_it, strip)
             continue
-        support[best] = -np.inf
         beside = strip.beside(points)
         if _stands_free(points, strip, beside, width):
             taken = _one_tape(points, strip.along, strip.inside, longest)
@@ -156,13 +153,63 @@ def floor_segments(
             segments.append(_segment(points, strip, taken, pixels, colour))
         else:
             # What is left of a solid must not pass for a thinner thing.
-            taken = np.union1d(strip.inside, beside[free[beside]])
-        free[taken] = False
-        fewer = counts[:, taken] @ near[taken]
-        support -= fewer[0]
-        starts -= fewer[1]
+            taken = np.union1d(strip.inside, beside[starts.free[beside]])
+        starts.drop(best)
+        starts.take(taken)
     segments.sort(key=lambda s: -s.weight)
     return tuple(segments)
+
+
+class _Starts:
+    """C lines that strips may start from, of which the best are tried and take their points away.
+
+    :ivar free: which of the points no strip has taken (P,).
+    """
+
+    def __init__(
+        self, points: FloorPoints, normals: Array, offsets: Array, width: float,
+    ) -> None:
+        self.free = np.ones(len(points.floor), dtype=bool)
+        self._near = points.near(normals, offsets, width)
+        # Of each point what it weighs, and one; and of each line what its free points do.
+        self._counts = np.array([points.weight, self.free], np.float32)
+        self._weight, self._number = (self._counts @ self._near).astype(float)
+
+    def heaviest(self) -> int | None:
+        """The line along which free points weigh most; None where they are too few."""
+        self._weight[self._number < _LEAST_START] = -np.inf
+        best = int(self._weight.argmax())
+        return None if self._weight[best] < _LEAST_PIXELS else best
+
+    def free_along(self, line: int) -> NDArray[np.intp]:
+        """The free points along a line."""
+        along, = ((self._near[:, line] > 0.0) & self.free).nonzero()
+        return along
+
+    def drop(self, line: int) -> None:
+        """Try a line no more."""
+        self._weight[line] = -np.inf
+
+    def drop_like(self, start: NDArray[np.intp], strip: _Strip | None) -> None:
+        """Try no more lines like one that does not run on.
+
+        That is those that start from nearly the same points, or from points of a thing so short
+        alone.
+
+        :param start: the points along it.
+        :param strip: what it came to; None if to nothing.
+        """
+        common = self._near[start].sum(axis=0)
+        self._weight[common >= _ALIKE * np.maximum(self._number, len(start))] = -np.inf
+        if strip is not None:
+            self._weight[self._number == self._near[strip.inside].sum(axis=0)] = -np.inf
+
+    def take(self, taken: NDArray[np.intp]) -> None:
+        """Points that are free no more."""
+        self.free[taken] = False
+        weight, number = self._counts[:, taken] @ self._near[taken]
+        self._weight -= weight
+        self._number -= number
 
 
 def _segment(

@@ -17,19 +17,19 @@
 from __future__ import annotations
 
 from nccs_pose.estimation.aligner import Aligner
-from nccs_pose.estimation.elsewhere import Elsewhere
+from nccs_pose.estimation.alignment import Alignment
+from nccs_pose.estimation.elsewhere import Elsewhere, leaves_room
+from nccs_pose.estimation.frame import Frame
 from nccs_pose.estimation.judge import Found, is_expected, Judge
 from nccs_pose.estimation.ledger import Refused
 from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.stopwatch import Stopwatch
+from nccs_pose.estimation.shift_solve import Prior
 from nccs_pose.estimation.verdict import is_suspect
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.vision.colour import LineColour
-import numpy as np
-from numpy.typing import NDArray
 
 
 class Follower:
@@ -52,43 +52,56 @@ class Follower:
         self._frames_since_check = 0
 
     def follow(
-        self, image: NDArray[np.uint8], prediction: Prediction, colours: tuple[LineColour, ...],
-        history: LineHistory, watch: Stopwatch,
+        self, frame: Frame, prediction: Prediction, colours: tuple[LineColour, ...],
+        history: LineHistory,
     ) -> Found | Refused:
         """Lay a predicted pose on an image; refused where the whole must be searched.
 
-        :param image: (H, W, 3) uint8 BGR.
+        :param prediction: that of the frame, or a pose that was given.
         :param history: what images have said of the lines before.
         """
-        prior = (prediction.pose, prediction.information)
+        alignment = self._laid(frame, prediction, colours, history)
+        if isinstance(alignment, Refused):
+            return alignment
+        self._frames_since_check += 1
+        if (self._frames_since_check < self._options.check_every
+                and not (is_suspect(alignment) or prediction.is_vague or alignment.missing)
+                and len(alignment.lines) > 1):
+            return Found(alignment, float('nan'), alignment.explained)
+        return self._checked(frame, alignment, prediction)
+
+    def _laid(
+        self, frame: Frame, prediction: Prediction, colours: tuple[LineColour, ...],
+        history: LineHistory,
+    ) -> Alignment | Refused:
+        """Lay a predicted pose on an image: in its place or, if it does not hold, beside it."""
+        prior = Prior(prediction.pose, prediction.information)
         refused = Refused()
         for reach in (0.0, self._options.band):
             alignment = self._aligner.align(
-                image, prediction.pose, colours, reach=reach, prior=prior)
-            watch.lap('measure')
+                frame.image, prediction.pose, colours, reach=reach, prior=prior)
+            frame.watch.lap('measure')
             if alignment is None or not is_expected(
                     alignment, prediction, self._options.innovation_gate):
                 continue
-            against = self._judge.objection(image, alignment, history, expected=True)
+            against = self._judge.objection(frame.image, alignment, history, expected=True)
             if against is None:
-                break
+                return alignment
             refused = Refused(against, alignment)
-        else:
-            return refused
-        self._frames_since_check += 1
-        due = self._frames_since_check >= self._options.check_every
-        suspect = is_suspect(alignment)
-        if not (due or suspect or prediction.is_vague or alignment.missing
-                or len(alignment.lines) == 1):
-            return Found(alignment, float('nan'), alignment.explained)
-        masks = self._searcher.masks(image)
+        return refused
+
+    def _checked(
+        self, frame: Frame, alignment: Alignment, prediction: Prediction,
+    ) -> Found | Refused:
+        """Hold a pose that lies on an image where it is expected against all of the image."""
+        masks = self._searcher.masks(frame.image)
         claimed = self._searcher.on_lines(alignment.pose, masks)
-        watch.lap('detect')
-        if suspect or prediction.is_vague or self._elsewhere.leaves_room(alignment, claimed):
+        frame.watch.lap('detect')
+        if is_suspect(alignment) or prediction.is_vague or leaves_room(alignment, claimed):
             segments = self._searcher.strips(masks)
-            watch.lap('detect')
-            elsewhere = self._elsewhere.refused(image, alignment, prediction, segments)
-            watch.lap('associate')
+            frame.watch.lap('detect')
+            elsewhere = self._elsewhere.refused(frame.image, alignment, prediction, segments)
+            frame.watch.lap('associate')
             if elsewhere is not None:
                 # The next image is looked at as a whole as well.
                 return elsewhere

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # A line is horizontal or vertical when its direction is so up to this (rad).
-ALIGNED = 1e-9
+_ALIGNED = 1e-9
 # A root this close to the unit circle is a real yaw: two that nearly meet leave it by the root
 # of their rounding.
 _ON_CIRCLE = 1e-4
@@ -142,9 +142,9 @@ def all_minima(gram: Array, directions: Array) -> tuple[Minimum, ...]:
 
 def are_horizontal(directions: Array) -> bool:
     """Whether all directions (L, 3) lie in the ground's plane."""
-    return float(np.abs(directions[:, 2]).max()) <= ALIGNED
+    return float(np.abs(directions[:, 2]).max()) <= _ALIGNED
 
 
 def are_vertical(directions: Array) -> bool:
     """Whether all directions (L, 3) stand upright."""
-    return float(np.abs(directions[:, :2]).max()) <= ALIGNED
+    return float(np.abs(directions[:, :2]).max()) <= _ALIGNED

@@ -56,21 +56,19 @@ class GivenPose:
         """Whether no image has been asked about yet."""
         return self._course.last is None
 
-    def expected(self, stamp_ns: int, wheels: Wheels | None) -> Prediction | None:
-        """Where the robot is at an image; None where it may be anywhere by now.
+    def carried_on(self, stamp_ns: int, wheels: Wheels | None) -> Prediction | None:
+        """Carry it on to an image: where the robot is there, None where it may be anywhere by now.
 
         :param wheels: what they say then; without, the robot may have driven at any speed.
         """
         expected: Prediction | None = self._told
-        last = self._course.last
-        if last is not None and last.stamp_ns != stamp_ns:
+        if not self.is_new:
             carried = self._course.at(stamp_ns, wheels)
             expected = None if carried is None else replace(carried, is_given=True)
         # Without wheels what it may have driven since counts from the first image without.
-        if expected is not None and (last is None or wheels is not None):
+        if expected is not None and (self.is_new or wheels is not None):
             if self._way is None and wheels is not None:
                 self._way = wheels.way
-            self._told = expected
             self._course = Course(Track(
                 stamp_ns, expected.pose, expected.carried, wheels, stamp_ns, self._way))
         return expected

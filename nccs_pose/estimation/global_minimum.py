@@ -115,18 +115,10 @@ def proved_minimum(gram: Array) -> Minimum | None:
     return minimum_at(gram, yaw)
 
 
-def coefficients(gram: Array) -> Array:
-    """N and D (10, 2) in 1, 0, cos yaw, sin yaw, cos 2 yaw, .. sin 4 yaw.
-
-    :param gram: Gram matrix of S (7, 7).
-    """
-    return _FOURIER @ ratio(gram).T
-
-
 def is_global(full_and_minor: Array, yaw: float) -> bool:
     """Whether a local minimum of J is proved to be the global one.
 
-    :param full_and_minor: coefficients of N and D (10, 2).
+    :param full_and_minor: coefficients of N and D in 1, 0, cos yaw, sin yaw, .. sin 4 yaw (10, 2).
     :param yaw: of the minimum, radians.
     """
     here = np.exp(yaw * _HARMONICS)

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import math
 
 from nccs_pose.errors import EstimationError
-from nccs_pose.estimation.general_lines import ALIGNED, all_minima
+from nccs_pose.estimation.general_lines import all_minima, are_horizontal
 from nccs_pose.estimation.global_minimum import global_minimum
 from nccs_pose.estimation.labelled_rays import LabelledRays
 from nccs_pose.estimation.local_minimum import minimum_near
@@ -189,7 +189,7 @@ def _weighted(data: LabelledRays, pose: Pose2) -> _Found:
         weights = 1.0 / data.variance(pose)
         before = pose
         pose = minimum_near(gram(data.rows, weights), data.directions, pose).pose
-        if abs(_difference(pose.yaw, before.yaw)) < _CLOSE_START:
+        if abs(math.remainder(pose.yaw - before.yaw, 2.0 * math.pi)) < _CLOSE_START:
             break
     return _polished(data, weights, pose)
 
@@ -218,19 +218,13 @@ def _same(a: _Found, b: _Found) -> bool:
     return bool(step @ better.information @ step < _SAME_POSE**2) and abs(step[2]) < 0.5 * math.pi
 
 
-def _difference(a: float, b: float) -> float:
-    return math.remainder(a - b, 2.0 * math.pi)
-
-
 def _solution(data: LabelledRays, found: _Found) -> Solution:
     x, y = (found.pose.x + data.origin[0], found.pose.y + data.origin[1])
     pose = Pose2(x, y, found.pose.yaw)
     unobserved = unobserved_directions(found.information, pose)
     # At a known height a central camera sees what ours does.
-    if not (np.abs(data.directions[:, 2]) <= ALIGNED).all():
+    if not are_horizontal(data.directions):
         central = unobserved_directions(data.central_information(found.pose), pose)
         unobserved = max(unobserved, central, key=len)
-    covariance = None
-    if not unobserved:
-        covariance = inverse(found.information)
+    covariance = None if unobserved else inverse(found.information)
     return Solution(pose, found.chi2, found.information, covariance, unobserved)

@@ -65,28 +65,28 @@ class OpenPoses:
 
     :ivar hypotheses: the best first; none where there is nothing to decide.
     :ivar stamp_ns: of that image.
-    :ivar odometry: what the wheels said then; None without odometry.
+    :ivar wheels: what they said then; None without odometry.
     """
 
     hypotheses: tuple[Hypothesis, ...] = ()
     stamp_ns: int = 0
-    odometry: Wheels | None = None
+    wheels: Wheels | None = None
 
     def __bool__(self) -> bool:
         """Whether anything is left to decide."""
         return bool(self.hypotheses)
 
-    def at(self, stamp_ns: int, odometry: Wheels | None) -> tuple[Hypothesis, ...]:
+    def at(self, stamp_ns: int, wheels: Wheels | None) -> tuple[Hypothesis, ...]:
         """Where they are by another image; without wheels still there, or somewhere near.
 
-        :param odometry: what the wheels say then.
+        :param wheels: what they say then.
         """
-        if self.odometry is None or odometry is None:
+        if self.wheels is None or wheels is None:
             seconds = 1e-9 * (stamp_ns - self.stamp_ns)
             step, (way, turn) = Pose2(0.0, 0.0, 0.0), (speed * seconds for speed in SPEED)
         else:
-            step = self.odometry.pose.inverse() @ odometry.pose
-            way, turn = (b - a for a, b in zip(self.odometry.leapt, odometry.leapt))
+            step = self.wheels.pose.inverse() @ wheels.pose
+            way, turn = (b - a for a, b in zip(self.wheels.leapt, wheels.leapt))
         return tuple(
             replace(h, pose=h.pose @ step, apart=(h.apart[0] + way, h.apart[1] + turn))
             for h in self.hypotheses)

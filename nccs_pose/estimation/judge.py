@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lays poses on images and says which of them hold, and why the others do not."""
+"""Which poses that were laid on an image hold, and why the others do not: what all of it says."""
 
 from __future__ import annotations
 
@@ -24,28 +24,24 @@ from nccs_pose.estimation.alignment import Alignment, close, leaves_open
 from nccs_pose.estimation.association import FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
 from nccs_pose.estimation.line_history import BEYOND_DOUBT, LineHistory, WEAK
-from nccs_pose.estimation.misplaced import placement, plainly_in_place
+from nccs_pose.estimation.misplaced import LineFinder, plainly_in_place
 from nccs_pose.estimation.motion import Prediction
-from nccs_pose.estimation.observability import COINCIDENT
+from nccs_pose.estimation.observability import parallel_to
 from nccs_pose.estimation.options import LocaliserOptions
-from nccs_pose.estimation.prediction import BandPredictor
 from nccs_pose.estimation.search import Searcher
 from nccs_pose.estimation.verdict import (
     contradiction,
     is_weak,
+    line_name,
     lines_used,
     Objection,
     objection,
 )
-from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
 
-# Stations of a line that is looked for beside its place stand so close, px.
-_CLOSE = 4.0
 # Without a prediction a pose on two lines must explain this fraction of what should be seen and of
 # what is seen, one on three lines that of either; more lines speak for themselves. Where one
 # is missing, fewer strips than this are no evidence: they lie on lines at any pose made of them.
@@ -67,7 +63,7 @@ _UNFIXED = Objection('the lines that it rests on do not fix a pose')
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A pose that holds.
+    """A pose laid on an image, and how much that shows of it; as a verdict, one that holds.
 
     :ivar alignment: as laid on the image.
     :ivar claimed: fraction of the line-like pixels that it explains; NaN if not looked at.
@@ -83,19 +79,18 @@ class Found:
     @property
     def shown(self) -> float:
         """How much it explains, however well its lines lie on the image, 0 to 1."""
-        return shown(self.by_strips, self.alignment)
+        return _shown(self.by_strips, self.alignment)
 
 
 class Judge:
     """Judges poses laid on images of one rig and map."""
 
     def __init__(
-        self, searcher: Searcher, predictor: BandPredictor, table: FloorTable, line_map: LineMap,
+        self, searcher: Searcher, finder: LineFinder, line_map: LineMap,
         options: LocaliserOptions,
     ) -> None:
-        self._predictor = predictor
         self._searcher = searcher
-        self._table = table
+        self._finder = finder
         self._map = line_map
         self._options = options
 
@@ -108,50 +103,48 @@ class Judge:
         :param history: what images have said of the lines before.
         :param expected: whether a prediction agrees with the pose.
         """
-        found = objection(alignment, self._map, self._options, expected=expected)
+        return objection(
+            alignment, self._map, self._options, expected=expected,
+        ) or self._objection_of_places(image, alignment, history, expected)
+
+    def _objection_of_places(
+        self, image: NDArray[np.uint8], alignment: Alignment, history: LineHistory, expected: bool,
+    ) -> Objection | None:
+        """What lines say that leave a question, looked for in their places and beside them."""
         # Out of nothing every line in view is looked at, else those that leave a question.
         least = WEAK if expected else np.inf
         support = alignment.support.tolist()
         asked = {*(k for k, part in enumerate(support) if part < least),
                  *(k for k in history.doubted if support[k] >= 0.0)}
-        if found is not None or not asked:
-            return found
-        asked -= plainly_in_place(alignment) | history.unasked(alignment)
+        if asked:
+            asked -= plainly_in_place(alignment) | history.unasked(alignment)
         if not asked:
             return None
-        colours: dict[str, LineColour] = {c.name: c for c in alignment.colours}
-        places = self._predictor.places(
-            alignment.pose, _CLOSE, self._options.stations, asked)
-        bands, slide = self._predictor.bands(places, alignment.pose)
-        moved = slide[:, 3:] @ alignment.refinement.attitude
-        for k in sorted(asked):
-            line, own = self._map[k], bands.label == k
-            seen = placement(
-                image, k, bands[own], moved[own], colours[line.colour], self._options.band,
-                alignment, self._map, self._table)
-            name = line.name or f'number {k}'
+        for k, seen in self._finder.placements(image, alignment, asked):
             if seen.beside is not None:
                 return Objection(
-                    f'line {name} is seen {seen.beside:.1f} px beside its place', line=k)
+                    f'{line_name(self._map, k)} is seen {seen.beside:.1f} px beside its place',
+                    line=k)
             others = lines_used(alignment) - (alignment.support[k] >= WEAK)
             if k in history.doubted and not seen.confirmed and others < BEYOND_DOUBT:
-                return Objection(f'line {name} was seen beside its place, and not in it since')
+                return Objection(
+                    f'{line_name(self._map, k)} was seen beside its place, and not in it since')
         return None
 
     def found(
         self, image: NDArray[np.uint8], alignment: Alignment,
         segments: tuple[FloorSegment, ...], history: LineHistory, *, expected: bool,
-        strips: FittedCandidate | None,
+        candidate: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose by the whole image.
 
-        :param strips: what these say of it, if that is known.
+        :param candidate: what the strips say of it, if that is known.
         """
         # What no lines hold in its place tells nothing of where other lines are.
         if leaves_open(alignment.refinement):
             return _UNFIXED
         return self.objection(image, alignment, history, expected=expected) or self.by_strips(
-            alignment, segments, expected=expected, strips=strips)
+            alignment, segments, expected=expected, candidate=candidate)
 
     def may_miss(self, alignment: Alignment, against: Objection) -> bool:
         """Whether lines that a refused pose misses may be near their places.
@@ -160,64 +153,71 @@ class Judge:
         """
         if against is not _UNFIXED:
             return bool(alignment.missing)
-        x, y, _ = self._map.directions[alignment.support >= 0.0].T
-        return bool(np.abs(x * y[0] - y * x[0]).max() > COINCIDENT)
+        in_view = self._map.directions[alignment.support >= 0.0]
+        return not parallel_to(in_view[0], in_view).all()
 
     def by_strips(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...], *, expected: bool,
-        strips: FittedCandidate | None,
+        candidate: FittedCandidate | None,
     ) -> Found | Objection:
         """Judge a pose against which the image itself says nothing; see :meth:`found`."""
         against = contradiction(alignment, segments, self._map)
         if against is not None:
             return against
-        found = self.measured(alignment, segments, strips)
+        found = self.measured(alignment, segments, candidate)
         if found.score <= 0.0:
             return _NOTHING
-        used = lines_used(alignment)
-        weaker, stronger = sorted((found.claimed, alignment.explained))
-        if alignment.missing and len(segments) < _LEAST_STRIPS:
-            stronger = alignment.explained
-        least = {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0)
-        if not expected and least < _MOST:
-            return _unexplained(used)
-        broad = set(alignment.whole[
-            (alignment.support > WEAK) & (alignment.width >= _BROAD)].tolist())
-        if not expected and len(broad) < 2:
-            return Objection(
-                f'all but {len(broad)} of the lines that it rests on are thinner '
-                f'than {_BROAD} px', hidden=True)
-        return found
+        return found if expected else _too_little(found, len(segments)) or found
 
     def beforehand(
-        self, strips: FittedCandidate, lines_in_view: Callable[[Pose2], int],
+        self, candidate: FittedCandidate, lines_in_view: Callable[[Pose2], int],
     ) -> Objection | None:
         """What strips alone say against a pose that nothing expects; None if nothing.
 
         :param lines_in_view: how many lines should be seen from a pose.
         """
-        if strips.claimed >= _MOST:
+        if candidate.claimed >= _MOST:
             return None
-        seen = lines_in_view(strips.pose)
+        seen = lines_in_view(candidate.pose)
         return _unexplained(seen) if seen < 3 else None
 
     def measured(
         self, alignment: Alignment, segments: tuple[FloorSegment, ...],
-        strips: FittedCandidate | None = None,
+        candidate: FittedCandidate | None = None,
     ) -> Found:
         """How much a pose explains, whether it holds or not; see :meth:`found`."""
-        score, claimed = (strips.score, strips.claimed) if strips is not None else (
+        score, claimed = (candidate.score, candidate.claimed) if candidate is not None else (
             self._searcher.score(alignment.pose, segments))
         return Found(
-            alignment, claimed, shown(score, alignment) * fit_of(alignment.points.variance),
+            alignment, claimed, _shown(score, alignment) * fit_of(alignment.points.variance),
             score)
+
+
+def _too_little(found: Found, strips: int) -> Objection | None:
+    """Why a pose that nothing expects rests on too little; None if it does not.
+
+    :param strips: how many the image shows.
+    """
+    alignment, used = found.alignment, lines_used(found.alignment)
+    weaker, stronger = sorted((found.claimed, alignment.explained))
+    if alignment.missing and strips < _LEAST_STRIPS:
+        stronger = alignment.explained
+    if {1: weaker, 2: weaker, 3: stronger}.get(used, 1.0) < _MOST:
+        return _unexplained(used)
+    broad = set(alignment.whole[
+        (alignment.support > WEAK) & (alignment.width >= _BROAD)].tolist())
+    if len(broad) < 2:
+        return Objection(
+            f'all but {len(broad)} of the lines that it rests on are thinner than {_BROAD} px',
+            hidden=True)
+    return None
 
 
 def _unexplained(lines: int) -> Objection:
     return Objection(f'it rests on {lines} lines and leaves too much unexplained', hidden=True)
 
 
-def shown(by_strips: float, alignment: Alignment) -> float:
+def _shown(by_strips: float, alignment: Alignment) -> float:
     """How much a pose explains by strips and by the lines that should be seen, 0 to 1."""
     return math.sqrt(by_strips * alignment.explained)
 
@@ -236,11 +236,11 @@ def explains_nearly_all(found: Found) -> bool:
             and min(found.claimed, found.alignment.explained) >= _NEARLY_ALL)
 
 
-def is_expected(alignment: Alignment, prediction: Prediction | None, gate: float) -> bool:
+def is_expected(alignment: Alignment, prediction: Prediction | None, sigmas: float) -> bool:
     """Whether a pose is where a prediction says, within so many deviations."""
     if prediction is None:
         return False
     if is_weak(alignment):
-        gate = min(gate, _WEAK_GATE)
+        sigmas = min(sigmas, _WEAK_GATE)
     return close(
-        alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, gate)
+        alignment.pose, prediction.pose, prediction.covariance + alignment.covariance, sigmas)

@@ -26,7 +26,7 @@ from nccs_pose.estimation.pose_monomials import (
     monomials_jacobian,
     with_derivatives,
 )
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array, cross_matrix, Pose2
 from nccs_pose.geometry.rig import Rays
 from nccs_pose.geometry.small_matrices import solve_3x3
 import numpy as np
@@ -79,7 +79,7 @@ class LabelledRays:
         if not used.all():
             self.index, lines = (np.cumsum(used) - 1)[label], lines[used]
         self.origin = _middle(lines)
-        lines[:, 3:] = moments_about(self.origin, lines[:, :3], lines[:, 3:])
+        lines[:, 3:] = _moments_about(self.origin, lines[:, :3], lines[:, 3:])
         self.lines = lines
         self.sigma2 = sigma * sigma
         self._sigma2_world = sigma_world**2
@@ -184,16 +184,10 @@ def into_base(pose: Pose2) -> Array:
         [0.0, 0.0, -q, c, s, 0.0], [0.0, 0.0, p, -s, c, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]])
 
 
-def cross_matrix(vector: Array) -> Array:
-    """The matrix (3, 3) that turns b into vector x b."""
-    x, y, z = vector.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def moments_about(origin: Array, directions: Array, moments: Array) -> Array:
+def _moments_about(origin: Array, directions: Array, moments: Array) -> Array:
     """Moments (L, 3) of lines about a point (2,) on the ground, mu - o x d."""
-    x, y = origin.tolist()
-    return moments + directions @ np.array([[0.0, 0.0, y], [0.0, 0.0, -x], [-y, x, 0.0]])
+    # d times the matrix is d x o.
+    return moments + directions @ cross_matrix(np.append(origin, 0.0))
 
 
 def _middle(lines: Array) -> Array:

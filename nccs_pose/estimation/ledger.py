@@ -23,9 +23,9 @@ import math
 from nccs_pose.estimation.alignment import Alignment
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.estimate import Candidate
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.judge import explains_nearly_all, fit_of, Found
 from nccs_pose.estimation.many_poses import Poses, same_pose, unlike
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import Objection
 from nccs_pose.geometry.pose import Pose2
 import numpy as np
@@ -40,10 +40,17 @@ ABOUT_AS_MUCH = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A pose that was laid on the image, and what the image says against it."""
+    """A pose that was laid on the image, and what the image says against it.
+
+    :ivar objection: None if nothing lay there to object to.
+    :ivar alignment: the pose; None where it is not to be compared with others.
+    :ivar misled: whether the prediction itself may be of another place of a map nearly symmetric:
+        then no pose is believed for being expected.
+    """
 
     objection: Objection | None = None
     alignment: Alignment | None = None
+    misled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,24 +85,23 @@ class Ledger:
     """
 
     def __init__(
-        self, symmetries: Sequence[Pose2], told: Told | None, ratio: float,
+        self, symmetries: Sequence[Pose2], gate: Gate | None, ratio: float,
         left: Iterable[FittedCandidate], others: Poses,
     ) -> None:
         """Begin.
 
         :param symmetries: motions of the map that change nothing, without the identity.
-        :param told: where the robot is by something else than the image; without it nothing is
+        :param gate: where the robot is by something else than the image; without it nothing is
             learned of a twin by laying it on the image too.
         :param ratio: a pose that scores this part of the best is its equal.
         :param left: candidates that are not to be laid on the image.
         :param others: poses that leave no strip unexplained, besides the candidates.
         """
         self.best: Found | None = None
-        self._best_misfit = 0.0
-        # How the best moved from where its strips put it, in base_link.
-        self._moved = Pose2(0.0, 0.0, 0.0)
+        # What the strips say of the pose that the best started from; None if nothing.
+        self._best_candidate: FittedCandidate | None = None
         self._symmetries = symmetries
-        self._told = told
+        self._gate = gate
         self._ratio = ratio
         # Poses that lie on the image, whatever it says of them.
         self._laid: list[Pose2] = []
@@ -134,7 +140,7 @@ class Ledger:
         return self.best is not None and len(
             [f for f in self._held if f.score >= self._ratio * self.best.score]) > 1
 
-    def beats(self, strips: FittedCandidate) -> bool:
+    def beats(self, candidate: FittedCandidate) -> bool:
         """Whether a pose, by what strips show of it, has no chance against the best that holds.
 
         On the image no pose scores more than the square root of what it scores by strips, times
@@ -145,44 +151,47 @@ class Ledger:
         best, ratio = self.best, self._ratio
         if best is None:
             return False
-        if explains_nearly_all(best) and strips.score < ratio * best.by_strips and (
-                strips.claimed < ALL_STRIPS):
+        if explains_nearly_all(best) and candidate.score < ratio * best.by_strips and (
+                candidate.claimed < ALL_STRIPS):
             return True
-        excess = max(strips.misfit**2 - self._best_misfit**2, 0.0)
-        return math.sqrt(strips.score) * fit_of(excess) < ratio * best.score
+        misfit = 0.0 if self._best_candidate is None else self._best_candidate.misfit
+        excess = max(candidate.misfit**2 - misfit**2, 0.0)
+        return math.sqrt(candidate.score) * fit_of(excess) < ratio * best.score
 
-    def leave(self, strips: FittedCandidate) -> None:
+    def leave(self, candidate: FittedCandidate) -> None:
         """Leave a candidate that was not laid on the image."""
-        self._left.append(strips)
+        self._left.append(candidate)
 
-    def pass_over(self, strips: FittedCandidate) -> None:
+    def pass_over(self, candidate: FittedCandidate) -> None:
         """Leave a candidate that is no rival of the best pose that holds."""
-        self._passed_over.append(strips)
+        self._passed_over.append(candidate)
 
-    def rule_out(self, strips: FittedCandidate, against: Objection) -> None:
+    def rule_out(self, candidate: FittedCandidate, against: Objection) -> None:
         """Refuse a candidate by its strips alone, unless something is hidden."""
         self._refused.append(Refused(against))
-        self._hidden.append(Candidate(strips.pose, strips.score))
+        self._hidden.append(Candidate(candidate.pose, candidate.score))
 
-    def begin(self, pose: Pose2) -> None:
-        """Note where a pose starts from; from a twin of that it would come to a twin of itself."""
-        self._settle_twins(pose)
+    def settle_twins(self, pose: Pose2) -> None:
+        """Note that nothing more would be learned of the twins of a pose that was tried.
 
-    def hold(self, found: Found, strips: FittedCandidate | None) -> list[Pose2]:
+        Twins of where it starts would come to twins of where it ends.
+        """
+        if self._gate is None:
+            self._settled += self._twins(pose)
+
+    def hold(self, found: Found, candidate: FittedCandidate | None) -> list[Pose2]:
         """Note a pose that holds.
 
-        :param strips: what these say of the pose that it started from; None if nothing.
+        :param candidate: what the strips say of the pose that it started from; None if nothing.
         :returns: those of its twins that have to be laid on the image too.
         """
         self._laid.append(found.alignment.pose)
-        self._settle_twins(found.alignment.pose)
+        self.settle_twins(found.alignment.pose)
         self._held.append(found)
         if self.best is None or found.score > self.best.score:
-            self.best = found
-            self._best_misfit, self._moved = (0.0, Pose2(0.0, 0.0, 0.0)) if strips is None else (
-                strips.misfit, strips.pose.inverse() @ found.alignment.pose)
-        twins, told = self._twins(found.alignment.pose), self._told
-        there = [told is not None and told.holds(twin) for twin in twins]
+            self.best, self._best_candidate = found, candidate
+        twins, gate = self._twins(found.alignment.pose), self._gate
+        there = [gate is not None and gate.contains(twin) for twin in twins]
         self._equal += [twin for twin, near in zip(twins, there) if not near]
         return [twin for twin, near in zip(twins, there) if near]
 
@@ -201,13 +210,13 @@ class Ledger:
         """Note a pose that would hold, if something hid the lines that it misses."""
         pose = shown.alignment.pose
         self._note(against, shown.alignment)
-        alike = (pose, *self._twins(pose)) if self._told is None else (pose,)
+        alike = (pose, *self._twins(pose)) if self._gate is None else (pose,)
         self._hidden.extend(Candidate(p, shown.by_strips) for p in alike)
         self._excused.append(shown)
 
     def _note(self, against: Objection, alignment: Alignment) -> None:
         self._laid.append(alignment.pose)
-        self._settle_twins(alignment.pose)
+        self.settle_twins(alignment.pose)
         self._refused.append(Refused(against, alignment))
 
     def closed(self) -> Sifted:
@@ -218,49 +227,41 @@ class Ledger:
         if not held:
             return Sifted(held, self._hidden, self._refused, [], [], self._others)
         best, poses = held[0], [f.alignment.pose for f in held]
-        left_open = self._open(poses, best)
-        known, least = Poses.of([*poses, *self._laid]), self._ratio * best.by_strips
-        left_open += self._unlaid([c for c in self._left if c.score >= least], known, best)
+        twins = self._equal_to_none(poses)
+        known = Poses.of([*poses, *twins, *self._laid])
+        least, least_shown = self._ratio * best.by_strips, self._ratio * best.shown
+        left_open = [
+            # One that explains nearly all, and more than the best does, leaves the best in doubt.
+            *(Candidate(f.alignment.pose, best.score) for f in self._excused
+              if explains_nearly_all(f) and f.score > best.score),
+            # How well lines lie says little on an image that leaves such doubts.
+            *(Candidate(f.alignment.pose, min(f.shown / best.shown, 1.0) * best.score)
+              for f in self._doubtful if f.shown >= least_shown),
+            # A twin shows what the pose that holds does, even if it was laid on it and refused.
+            *(Candidate(twin, best.score) for twin in twins),
+            *self._unlaid([c for c in self._left if c.score >= least], known, best)]
+        hidden = [*self._hidden, *(Candidate(f.alignment.pose, f.by_strips)
+                                   for f in self._doubtful if f.shown < least_shown)]
         # More of the lines of what explains the same strips may be there than they show.
         less = (*(c for c in self._left if c.score < least), *self._passed_over)
         rest = self._unlaid(
             [c for c in less if c.claimed > best.claimed - AS_MUCH], known, best)
         others = self._others
-        if len(others.place) > 0:
+        if len(others):
             others = others[unlike(others, known)]
         return Sifted(
-            held, self._hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest,
-            others)
+            held, hidden, self._refused, sorted(left_open, key=lambda c: -c.score), rest, others)
 
     def _twins(self, pose: Pose2) -> list[Pose2]:
         return [s @ pose for s in self._symmetries]
 
-    def _settle_twins(self, pose: Pose2) -> None:
-        if self._told is None:
-            self._settled += self._twins(pose)
-
-    def _open(self, known: list[Pose2], best: Found) -> list[Candidate]:
-        """Poses that were laid on the image, or their twins, and are left open; hides others.
-
-        :param known: those that hold; what is left open is added.
-        """
-        # A pose that explains nearly all, and more than the best does, leaves the best in doubt.
-        found = [Candidate(excused.alignment.pose, best.score)
-                 for excused in self._excused
-                 if explains_nearly_all(excused) and excused.score > best.score]
-        for doubtful in self._doubtful:
-            pose = doubtful.alignment.pose
-            # How well its lines lie says little on an image that leaves such doubts.
-            if doubtful.shown >= self._ratio * best.shown:
-                found.append(Candidate(pose, min(doubtful.shown / best.shown, 1.0) * best.score))
-            else:
-                self._hidden.append(Candidate(pose, doubtful.by_strips))
-        # A twin shows what the pose that holds does, even if it was laid on the image and refused.
+    def _equal_to_none(self, poses: list[Pose2]) -> list[Pose2]:
+        """Twins of what holds that are the same as none of some poses, nor as one another."""
+        new: list[Pose2] = []
         for twin in self._equal:
-            if not any(same_pose(twin, pose) for pose in known):
-                known.append(twin)
-                found.append(Candidate(twin, best.score))
-        return found
+            if not any(same_pose(twin, pose) for pose in (*poses, *new)):
+                new.append(twin)
+        return new
 
     def _unlaid(
         self, left: list[FittedCandidate], known: Poses, best: Found,
@@ -268,14 +269,16 @@ class Ledger:
         """Candidates that were not laid on the image, nor their likes."""
         if not left:
             return []
-        poses = Poses.of([strips.pose for strips in left])
+        poses = Poses.of([candidate.pose for candidate in left])
         # They differ among themselves.
         new = unlike(poses, known)
         score = np.minimum(
-            np.array([strips.score for strips in left]) / best.by_strips, 1.0) * best.score
-        # Strips that lie askew do so at all places where they look the same.
-        moved = poses[new].and_on_by(self._moved)
-        return [Candidate(*of) for of in zip(moved.listed(), score[new].tolist())]
+            np.array([candidate.score for candidate in left]) / best.by_strips, 1.0) * best.score
+        poses = poses[new]
+        if self.best is not None and self._best_candidate is not None:
+            # Strips that lie askew do so at all places where they look the same.
+            poses = poses @ (self._best_candidate.pose.inverse() @ self.best.alignment.pose)
+        return [Candidate(*of) for of in zip(poses.listed(), score[new].tolist())]
 
 
 def _ranked(held: list[Found]) -> list[Found]:

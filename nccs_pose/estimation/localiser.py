@@ -30,21 +30,22 @@ from nccs_pose.errors import FrameRefusedError, GeometryError
 from nccs_pose.estimation import answers
 from nccs_pose.estimation.admission import Admission
 from nccs_pose.estimation.aligner import Aligner
-from nccs_pose.estimation.alignment import OPEN
+from nccs_pose.estimation.alignment import Alignment, OPEN
 from nccs_pose.estimation.case import Case
 from nccs_pose.estimation.coasting import may_coast, shows_another_place, shows_this_place
 from nccs_pose.estimation.course import Course
 from nccs_pose.estimation.decision import left_open, may_show, the_one_expected
-from nccs_pose.estimation.elsewhere import FITS_ELSEWHERE
 from nccs_pose.estimation.estimate import Doubted, Estimate, State
 from nccs_pose.estimation.following import Follower
 from nccs_pose.estimation.frame import Frame
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.given_pose import GivenPose
 from nccs_pose.estimation.hypotheses import ambiguity, Hypothesis, LEAST_IMAGES, OpenPoses
 from nccs_pose.estimation.judge import Found, Judge
 from nccs_pose.estimation.ledger import Refused, Sifted
 from nccs_pose.estimation.line_history import LineHistory
 from nccs_pose.estimation.many_poses import same_pose
+from nccs_pose.estimation.misplaced import LineFinder
 from nccs_pose.estimation.motion import Prediction
 from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.odometry import Odometry
@@ -55,7 +56,6 @@ from nccs_pose.estimation.sifting import Sifter
 from nccs_pose.estimation.sights import Sight, sights
 from nccs_pose.estimation.stopwatch import Stopwatch
 from nccs_pose.estimation.symmetries import map_symmetries
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.verdict import what_is_missing
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -120,8 +120,8 @@ class Localiser:
         aligner = Aligner(self._table, self._map, options)
         self._nominal_colours = aligner.nominal_colours
         self._searcher = Searcher(self._table, self._map, options)
-        self._judge = Judge(
-            self._searcher, aligner.predictor, self._table, self._map, options)
+        finder = LineFinder(aligner.predictor, self._table, self._map, options)
+        self._judge = Judge(self._searcher, finder, self._map, options)
         self._follower = Follower(aligner, self._searcher, self._judge, self._map, options)
         rivals = Rivals(aligner, self._searcher, self._judge, self._symmetries, options)
         self._sifter = Sifter(aligner, self._judge, rivals, self._symmetries, options)
@@ -141,10 +141,9 @@ class Localiser:
         self._course = Course()
         self._given: GivenPose | None = None
         self._ever_tracked = False
-        # Whether an image has shown another place than expected since the last pose.
-        self._shaken = False
-        # Images in a row since then that agree with what was expected, but hide too much for one.
-        self._agreeing = 0
+        # How many images in a row have yet to agree with what is expected before the last pose is
+        # coasted on again: one since it has shown another place.
+        self._have_to_agree = 0
         # Images in a row that were searched and showed no pose.
         self._in_vain = 0
         self._colours = self._fresh_colours()
@@ -179,7 +178,7 @@ class Localiser:
         try:
             self._odometry.add(stamp_ns, pose)
         except FrameRefusedError:
-            self._open = replace(self._open, odometry=None)
+            self._open = replace(self._open, wheels=None)
             if self._given is not None:
                 self._given.forget_odometry()
             self._course = self._course.without_odometry()
@@ -205,12 +204,12 @@ class Localiser:
             self._given = given
         watch = Stopwatch()
         wheels = self._odometry.at(stamp_ns)
-        prediction = self._course.at(stamp_ns, wheels, doubted=self._shaken)
+        prediction = self._course.at(stamp_ns, wheels, doubted=self._have_to_agree > 0)
         frame = Frame(stamp_ns, image, wheels, prediction, watch)
         watch.lap('predict')
         if prediction is None:
             return self._search(frame, Refused())
-        followed = self._follower.follow(image, prediction, self._colours, self._history, watch)
+        followed = self._follower.follow(frame, prediction, self._colours, self._history)
         if isinstance(followed, Found):
             return self._tracking(
                 frame, followed, 'the pose explains the image', prior=prediction)
@@ -222,23 +221,21 @@ class Localiser:
         :param refused: what came of following the robot to the image.
         """
         is_first = frame.prediction is None and not self._open
-        if refused.objection is FITS_ELSEWHERE:
-            # A pose is no longer believed for being expected.
+        if refused.misled:
             frame = replace(frame, prediction=None)
-        given = None if self._given is None else self._given.expected(
+        given = None if self._given is None else self._given.carried_on(
             frame.stamp_ns, frame.wheels)
-        told = self._told(given or frame.prediction)
+        gate = self._gate_of(given or frame.prediction)
         hypotheses = self._open.at(frame.stamp_ns, frame.wheels)
-        looks, last = self._looks(frame, told, hypotheses)
+        looks, last = self._looks(frame, gate, hypotheses)
         sifted = looks[last]
-        held = sifted.held
-        self._in_vain = 0 if held else self._in_vain + 1
+        self._in_vain = 0 if sifted.held else self._in_vain + 1
         if refused.alignment is not None:
             # No jump to where less is explained than at the pose that was refused.
             here = self._judge.measured(refused.alignment, last.segments).score
-            held = [f for f in held if f.score > here or same_pose(
-                f.alignment.pose, refused.alignment.pose)]
-        if not held:
+            sifted = replace(sifted, held=[f for f in sifted.held if f.score > here or same_pose(
+                f.alignment.pose, refused.alignment.pose)])
+        if not sifted.held:
             trusted = None if given is None else self._trusted(frame, given, last)
             if trusted is not None:
                 return self._tracking(
@@ -246,32 +243,32 @@ class Localiser:
             if refused.objection is None:
                 refused = next(chain.from_iterable(s.refused for s in looks.values()), refused)
             return self._without_pose(frame, last, refused)
-        chosen = the_one_expected(held, sifted, told, frame.prediction, self._options)
+        chosen = the_one_expected(sifted, gate, frame.prediction, self._options)
         if chosen is not None:
-            words = _FOUND if len(held) == 1 else (
+            words = _FOUND if len(sifted.held) == 1 else (
                 'several poses explain the image; the one expected was taken')
-            return self._tracking(frame, chosen, words, held=held)
-        return self._decided(frame, held, sifted, told, hypotheses, is_first)
+            return self._tracking(frame, chosen, words, held=sifted.held)
+        return self._decided(frame, sifted, gate, hypotheses, is_first)
 
     def _decided(
-        self, frame: Frame, held: list[Found], sifted: Sifted, told: Told | None,
-        before: Sequence[Hypothesis], is_first: bool,
+        self, frame: Frame, sifted: Sifted, gate: Gate | None, before: Sequence[Hypothesis],
+        is_first: bool,
     ) -> Estimate:
         """Decide between poses by all images since they were first seen, or leave them open.
 
-        :param held: those that explain this image, best first.
-        :param sifted: what else the search of it left.
+        :param sifted: what the search of this image left; some pose explains it.
         :param before: those that the images before left open, where they are by now.
         :param is_first: whether nothing was expected of the image; else two have to agree.
         """
-        hypotheses, more = left_open(before, held, sifted)
+        held = sifted.held
+        hypotheses, more = left_open(before, sifted)
         self._open = OpenPoses(hypotheses, frame.stamp_ns, frame.wheels)
         best = hypotheses[0]
         if ambiguity(hypotheses) <= self._options.ambiguity_ratio and (
                 is_first or len(best.scores) >= LEAST_IMAGES):
             found = next(f for f in held if f.alignment.pose == best.pose)
             return self._tracking(frame, found, _FOUND, held=held)
-        if told is not None and not may_show(told, held, sifted):
+        if gate is not None and not may_show(gate, sifted):
             # Carried on for long, what was expected would agree with one of them by chance.
             if self._refuted_ns is None:
                 self._refuted_ns = frame.stamp_ns
@@ -280,19 +277,19 @@ class Localiser:
         return answers.undecided(frame, held[0], hypotheses, more, self._options, self._unknown)
 
     def _looks(
-        self, frame: Frame, told: Told | None, hypotheses: tuple[Hypothesis, ...],
+        self, frame: Frame, gate: Gate | None, hypotheses: tuple[Hypothesis, ...],
     ) -> tuple[dict[Sight, Sifted], Sight]:
         """Look at an image in one way after the other, until one shows a pose.
 
         :returns: what came of each sight, in order, and the one to go by.
         """
         looks: dict[Sight, Sifted] = {}
-        for sight in sights(frame.image, self._searcher, self._fresh_colours(), self._in_vain,
-                            told, frame.watch.lap):
+        for sight in sights(
+                frame, self._searcher, self._fresh_colours(), gate, in_vain=self._in_vain):
             # One that comes again would come to the same.
             if sight not in looks:
                 looks[sight] = self._sifter.sift(
-                    Case(sight, self._history, frame.prediction, told, looks), hypotheses)
+                    Case(sight, self._history, frame.prediction, gate, looks), hypotheses)
             sifted = looks[sight]
             frame.watch.lap('measure')
             # On a sight that came early, though it promises little, one pose alone proves nothing.
@@ -301,18 +298,17 @@ class Localiser:
                 break
         return looks, sight
 
-    def _told(self, expected: Prediction | None) -> Told | None:
-        """Where a pose that was given, or the prediction, says that the robot is."""
+    def _gate_of(self, expected: Prediction | None) -> Gate | None:
+        """The gate about a pose that was given, or about the prediction."""
         if expected is None:
             return None
         if expected.is_given:
-            return Told(expected.pose, expected.carried, _PRIOR_GATE)
-        return Told(expected.pose, expected.covariance, self._options.innovation_gate)
+            return Gate(expected.pose, expected.carried, _PRIOR_GATE)
+        return Gate(expected.pose, expected.covariance, self._options.innovation_gate)
 
     def _trusted(self, frame: Frame, given: Prediction, sight: Sight) -> Found | None:
         """The pose that was given, where too little is in view to find it without."""
-        followed = self._follower.follow(
-            frame.image, given, self._colours, self._history, frame.watch)
+        followed = self._follower.follow(frame, given, self._colours, self._history)
         if not isinstance(followed, Found):
             return None
         _, claimed = self._searcher.score(followed.alignment.pose, sight.segments)
@@ -329,7 +325,7 @@ class Localiser:
         """
         alignment, covariance = found.alignment, found.alignment.covariance
         if prior is not None:
-            covariance = prior.without_floor(covariance, alignment.refinement.covariance)
+            covariance = prior.without_inflation(covariance, alignment.refinement.covariance)
         # Whoever is told of it shares it with the track.
         covariance.setflags(write=False)
         unobserved = unobserved_directions(
@@ -342,7 +338,7 @@ class Localiser:
         if prior is None:
             self._follower.begin()
         self._open, self._given, self._refuted_ns = OpenPoses(), None, None
-        self._shaken, self._agreeing, self._ever_tracked = False, 0, True
+        self._have_to_agree, self._ever_tracked = 0, True
         return answers.tracking(frame, reason, held or [found], found, covariance, unobserved)
 
     def _without_pose(self, frame: Frame, sight: Sight, refused: Refused) -> Estimate:
@@ -352,23 +348,32 @@ class Localiser:
         if against is not None and against.line is not None:
             contradicted = self._history.contradicts(against.line)
             self._history = self._history.doubting(against.line)
-        if prediction is not None:
-            self._shaken |= contradicted or bool(self._open) or shows_another_place(
-                sight, prediction, self._searcher)
-        if prediction is not None and self._shaken:
-            agrees = not (self._open or self._history.doubted) and shows_this_place(
-                sight, prediction, refused.alignment, self._searcher, self._options)
-            self._agreeing = self._agreeing + 1 if agrees else 0
-            self._shaken = self._agreeing < LEAST_IMAGES
         missing = what_is_missing(sight.segments) if against is None else against.words
         doubted = None if refused.alignment is None else Doubted(
             refused.alignment.pose, refused.alignment.points)
-        if prediction is not None and not self._shaken:
+        if prediction is not None:
+            self._weigh(sight, prediction, refused.alignment, contradicted=contradicted)
             seconds = self._course.seconds_to(frame.stamp_ns)
-            if may_coast(prediction, seconds, self._options):
+            if not self._have_to_agree and may_coast(prediction, seconds, self._options):
                 return answers.coasting(frame, prediction, seconds, missing, doubted)
         return answers.without_pose(
             frame, self._unknown, missing, self._open.at(frame.stamp_ns, frame.wheels), doubted)
+
+    def _weigh(
+        self, sight: Sight, prediction: Prediction, refused: Alignment | None, *,
+        contradicted: bool,
+    ) -> None:
+        """Note whether an image that gives no pose speaks for the expected place or against it.
+
+        :param refused: the pose that was laid on it and refused; None if none lies there.
+        :param contradicted: whether a line speaks against the poses before as well.
+        """
+        if contradicted or self._open or shows_another_place(sight, prediction, self._searcher):
+            self._have_to_agree = LEAST_IMAGES
+        elif self._have_to_agree:
+            agrees = not self._history.doubted and shows_this_place(
+                sight, prediction, refused, self._searcher, self._options)
+            self._have_to_agree = self._have_to_agree - 1 if agrees else LEAST_IMAGES
 
     @property
     def _unknown(self) -> State:

@@ -43,13 +43,16 @@ class Poses:
         x, y, yaw = np.array([(pose.x, pose.y, pose.yaw) for pose in poses]).reshape(-1, 3).T
         return cls(np.exp(1j * yaw), x + 1j * y)
 
+    def __len__(self) -> int:
+        return len(self.place)
+
     def __getitem__(
         self, index: NDArray[np.intp] | NDArray[np.bool_] | list[int] | slice,
     ) -> Poses:
         return Poses(self.rotation[index], self.place[index])
 
-    def and_on_by(self, step: Pose2) -> Poses:
-        """Where a robot is that goes on from each by the same step, of base_link."""
+    def __matmul__(self, step: Pose2) -> Poses:
+        """Compose each with the same step, as of :class:`.Pose2`."""
         return Poses(
             self.rotation * complex(math.cos(step.yaw), math.sin(step.yaw)),
             self.place + self.rotation * complex(step.x, step.y))

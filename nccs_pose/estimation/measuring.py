@@ -23,7 +23,7 @@ from nccs_pose.estimation.alignment import Pass
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.prediction import BandPredictor, Places
 from nccs_pose.estimation.refine import Refinement
-from nccs_pose.estimation.shift_solve import weigh_shifts, WeighedShifts
+from nccs_pose.estimation.shift_solve import Prior, weigh_shifts, WeighedShifts
 from nccs_pose.estimation.whole_lines import first_pieces
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -46,8 +46,8 @@ _SEARCHED_SPACING = 8.0
 # A pass misses less than this part of the way to where it leads.
 _MOST_MISSED = 0.5
 
-# Some of a row of things: a slice, or a mask.
-Some = slice | NDArray[np.bool_]
+# Which of a row of things: a slice, or a mask.
+Selection = slice | NDArray[np.bool_]
 _ALL = slice(None)
 
 
@@ -61,8 +61,8 @@ class Part(NamedTuple):
     """
 
     colour: int
-    own: Some
-    groups: Some
+    own: Selection
+    groups: Selection
     bands: Bands
 
 
@@ -123,12 +123,9 @@ class Measurer:
         return Look(pose, attitude, bands, slide.T, read, rough)
 
     def measure(
-        self, look: Look, prior: tuple[Pose2, Array] | None, colours: tuple[LineColour, ...],
+        self, look: Look, prior: Prior | None, colours: tuple[LineColour, ...],
     ) -> Pass | None:
-        """Measure what was read, and solve; None where too few stations are felt.
-
-        :param prior: a pose with its information (3, 3).
-        """
+        """Measure what was read, and solve; None where too few stations are felt."""
         bands, slide, learned = look.bands, look.slide, list(colours)
         n = len(bands)
         shift, sigma, found = np.empty(n), np.empty(n), np.empty(n, dtype=bool)
@@ -168,14 +165,13 @@ class Measurer:
             look, first.weighed, replace(fit, shift=shift), first.used, tuple(colours))
 
     def search(
-        self, image: NDArray[np.uint8], start: Pose2, prior: tuple[Pose2, Array] | None,
+        self, image: NDArray[np.uint8], start: Pose2, prior: Prior | None,
         colours: tuple[LineColour, ...], reach: float,
     ) -> Refinement | None:
         """Look for the tapes up to so many pixels beside where a pose predicts them, and solve.
 
         :param image: (H, W, 3) uint8 BGR.
         :param start: the predicted pose, T_map_base.
-        :param prior: a pose with its information (3, 3), weighed in like a measurement.
         :param colours: what the tapes look like, one for each class.
         :param reach: to either side, px.
         :returns: None where too few stations show one.
@@ -216,7 +212,7 @@ class Measurer:
 
     def _weigh(
         self, shift: Array, sigma: Array, slide: Array, index: NDArray[np.intp], bands: Bands,
-        start: Pose2, prior: tuple[Pose2, Array] | None,
+        start: Pose2, prior: Prior | None,
     ) -> WeighedShifts:
         """Weigh what some stations say of the pose.
 
@@ -225,13 +221,13 @@ class Measurer:
         :param slide: d(shift)/d(x, y, yaw, z, roll, pitch) (N, 6).
         :param index: which of the bands they are (N,).
         """
-        options = self._options
+        options, image_sigma = self._options, None
+        if options.calibration_sigma > 0.0:
+            image_sigma = options.calibration_sigma * bands.across.take(index, axis=0)
         return weigh_shifts(
             shift, sigma, slide, index // bands.members, bands.label.take(index), start,
             prior=prior, attitude_sigma=(options.height_sigma, options.tilt_sigma),
-            image_shift=(
-                bands.across.take(index, axis=0) if options.calibration_sigma > 0.0 else None),
-            calibration_sigma=options.calibration_sigma)
+            image_sigma=image_sigma)
 
 
 def _by_group(values: Array, bands: Bands) -> Array:

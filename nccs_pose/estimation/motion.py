@@ -29,9 +29,9 @@ import numpy as np
 
 # Without odometry a velocity is believed for so long, s.
 _LONGEST_COAST = 1.0
-# What a prediction may be off by beside the motion's own part, metres and rad: it keeps the image,
-# not the prediction, in charge.
-_FLOOR_SIGMA = (0.02, 0.015)
+# By so much (m, m and rad, deviations) the covariance of a prediction is inflated: it keeps the
+# image, not the prediction, in charge.
+_INFLATION = np.diag([0.02, 0.02, 0.015])**2
 # What wheels gain in error over the first metre or radian; it grows with the square root.
 _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
@@ -53,12 +53,12 @@ PAST = 3
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """The last pose that an image gave.
+    """A pose that an image gave.
 
     :ivar stamp_ns: of the image.
     :ivar pose: T_map_base.
     :ivar covariance: of (x, y, yaw) (3, 3).
-    :ivar odometry: what the wheels said then; None without odometry.
+    :ivar wheels: what they said then; None without odometry.
     :ivar seen_ns: the last stamp at which the lines in view fixed every direction of the pose.
     :ivar seen_way: how far the wheels had rolled then, metres; None if they did not say.
     """
@@ -66,7 +66,7 @@ class Track:
     stamp_ns: int
     pose: Pose2
     covariance: Array
-    odometry: Wheels | None
+    wheels: Wheels | None
     seen_ns: int
     seen_way: float | None = None
 
@@ -107,7 +107,7 @@ class Prediction:
     @cached_property
     def covariance(self) -> Array:
         """What the image is weighed against: never so narrow that it would overrule the image."""
-        return self.carried + FLOOR
+        return self.carried + _INFLATION
 
     @cached_property
     def information(self) -> Array:
@@ -121,8 +121,8 @@ class Prediction:
         longest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)
         return self.is_given or longest > _SURE[0] ** 2 or tt > _SURE[1] ** 2
 
-    def without_floor(self, covariance: Array, solved: Array) -> Array:
-        """A covariance (3, 3) after the image, with what the floor brought in taken out again.
+    def without_inflation(self, covariance: Array, solved: Array) -> Array:
+        """A covariance (3, 3) after the image, with what the inflation brought in taken out.
 
         With the gain W = solved prior^-1 the solve gives W prior W^T + the image's part. Where
         the image says nothing, W is 1, and what is left of the pose's error is the carried one.
@@ -137,7 +137,6 @@ class Prediction:
 
 
 NO_FLAW = Flaw()
-FLOOR = np.diag([_FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[0] ** 2, _FLOOR_SIGMA[1] ** 2])
 
 
 def by_odometry(

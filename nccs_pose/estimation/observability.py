@@ -35,9 +35,10 @@ from dataclasses import dataclass
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import is_definite
 import numpy as np
+from numpy.typing import NDArray
 
 # Two lines of a map written by hand are parallel when they are so up to this, rad.
-COINCIDENT = 1e-6
+_PARALLEL = 1e-6
 # A component of a unit direction in (m, m, rad) that the words leave out.
 _SILENT = 1e-3
 
@@ -75,6 +76,12 @@ def unobserved_directions(
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         found.append(Unobserved(vector, _words(vector, pose)))
     return tuple(found)
+
+
+def parallel_to(direction: Array, directions: Array) -> NDArray[np.bool_]:
+    """Which of the directions (L, 3) of lines on the floor run along one (3,), either way (L,)."""
+    x, y, _ = directions.T
+    return np.asarray(np.abs(x * direction[1] - y * direction[0]) <= _PARALLEL)
 
 
 def _words(direction: Array, pose: Pose2) -> str:

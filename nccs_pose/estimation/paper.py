@@ -45,7 +45,7 @@ import math
 
 from nccs_pose.errors import EstimationError
 from nccs_pose.geometry.paper_polynomials import mirror_polynomials
-from nccs_pose.geometry.pose import Array, Pose2
+from nccs_pose.geometry.pose import Array, cross_matrix, Pose2
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import ArrayLike
@@ -104,7 +104,7 @@ class PaperFrame:
         axis = np.array([0.0, 0.0, math.copysign(1.0, up[2])])
         # smallest rotation from the tilted axis to the mirror's own (Rodrigues)
         v, cosine = np.cross(up, axis), float(up @ axis)
-        cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+        cross = cross_matrix(v)
         turn = (np.eye(3) + cross + cross @ cross / (1.0 + cosine)) @ into_mirror
         return cls(turn, -axis[2], turn @ rig.T_base_mirror.translation)
 
@@ -115,8 +115,8 @@ class PaperFrame:
 
     def parameters(self, pose: Pose2) -> Array:
         """(c, s, t_x, t_y) of a pose."""
-        theta = self.sense * pose.yaw
-        t = -_about_z(theta) @ self.turn @ pose.translation - self.mounting
+        theta = float(self.sense * pose.yaw)
+        t = -Pose2(yaw=theta).rotation @ self.turn @ pose.translation - self.mounting
         return np.array([math.cos(theta), math.sin(theta), t[0], t[1]])
 
     def pose(self, parameters: Array) -> Pose2:
@@ -124,13 +124,8 @@ class PaperFrame:
         c, s, t_x, t_y = parameters
         theta = math.atan2(s, c)
         moved = np.array([t_x + self.mounting[0], t_y + self.mounting[1], 0.0])
-        x, y, _ = self.turn.T @ (-_about_z(theta).T @ moved)
+        x, y, _ = self.turn.T @ (-Pose2(yaw=theta).rotation.T @ moved)
         return Pose2(x, y, self.sense * theta)
-
-
-def _about_z(angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 class PaperProblem:

@@ -54,7 +54,7 @@ DOUBTS = (_DOUBTFUL, _ON_A_CORNER, _TWO_COARSE)
 
 
 class Rivals:
-    """Of poses that hold on images of one rig and map."""
+    """Looks for rivals of poses that hold on images of one rig and map."""
 
     def __init__(
         self, aligner: Aligner, searcher: Searcher, judge: Judge, symmetries: tuple[Pose2, ...],
@@ -95,7 +95,7 @@ class Rivals:
             min(found.claimed, alignment.explained) > _PLAINLY_ALL)
         if alignment.missing and not (plain or sharp):
             return _INCOMPLETE
-        if case.told is None and self.are_many(found, candidates):
+        if case.gate is None and self.are_many(found, candidates):
             return None
         if few and not sharp:
             return _TWO_COARSE

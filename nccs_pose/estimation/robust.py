@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from nccs_pose.geometry.pose import Array
-from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.median import SIGMA_PER_MEDIAN, upper_median
 import numpy as np
 
 # Tuning constant of Cauchy's loss for 95 % efficiency under Gaussian noise.
@@ -27,17 +27,15 @@ GATE = 3.0
 # Where the lines say nothing the pose is still somewhere within 100 m and 10 rad: this keeps
 # every covariance finite and positive definite, and is too weak to move any pose.
 VAGUE_INFORMATION = np.diag([1e-4, 1e-4, 1e-2])
-# The median of |e| of Gaussian noise is its standard deviation over this.
-_OF_MEDIAN = 1.4826
 
 
 def robust_scale(e: Array) -> float:
     """Standard deviation of the bulk of whitened residuals (N,), never below the noise told."""
     size, low, high = np.abs(e), (len(e) - 1) // 2, len(e) // 2
     size.partition([low, high])
-    return max(1.0, _OF_MEDIAN * 0.5 * float(size[low] + size[high]))
+    return max(1.0, SIGMA_PER_MEDIAN * 0.5 * float(size[low] + size[high]))
 
 
 def robust_variance(square: Array) -> float:
     """Its square, from the residuals' squares (N,); of an even number by the upper median."""
-    return max(1.0, _OF_MEDIAN**2 * upper_median(square))
+    return max(1.0, SIGMA_PER_MEDIAN**2 * upper_median(square))

@@ -22,9 +22,9 @@ import math
 from nccs_pose.estimation.association import Associator, Candidates, FittedCandidate
 from nccs_pose.estimation.floor_points import PixelFloor
 from nccs_pose.estimation.floor_segments import floor_segments, FloorSegment, widest_gap
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.estimation.strip_pairs import BEYOND
-from nccs_pose.estimation.told import Told
 from nccs_pose.estimation.whole_lines import whole_lines
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import LineMap
@@ -35,7 +35,6 @@ from nccs_pose.vision.learned_contrast import feature_of, learned_colour
 from nccs_pose.vision.reduced import ReducedView
 from nccs_pose.vision.segment import (
     brightness,
-    chromatic_mask,
     contrast_of,
     hsv_mask,
     Mask,
@@ -122,28 +121,22 @@ class Searcher:
         self, part: NDArray[np.uint8], known: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look for what looks like the strips that are known."""
-        options = self._options
-        return self._by_example(part, known, colours, self._mask, lambda part, seen: raised_mask(
-            feature_of(part, seen), brightness(part), options.noise_gate, options.least_contrast,
-            self._window))
+        return self._by_example(
+            part, known, colours, lambda feature: self._raised(part, feature))
 
     def _look_along_by_example(
         self, part: NDArray[np.uint8], known: Strips, colours: Colours,
     ) -> tuple[Strips, Colours]:
         """Look along lines for what looks like the strips that are known."""
-        return self._by_example(
-            part, known, colours, lambda part, name: self._faint(contrast_of(part, name)),
-            lambda part, seen: self._faint(feature_of(part, seen)))
+        return self._by_example(part, known, colours, self._faint)
 
     def _by_example(
         self, part: NDArray[np.uint8], known: Strips, colours: Colours,
-        unseen: Callable[[NDArray[np.uint8], str], Mask],
-        mask_of: Callable[[NDArray[np.uint8], LineColour], Mask],
+        mask_of: Callable[[Mask], Mask],
     ) -> tuple[Strips, Colours]:
         """Learn the colours of which strips are known, and look again.
 
-        :param unseen: mask of a colour, by its class, of which none is.
-        :param mask_of: of one that was learned.
+        :param mask_of: where tapes are, by a feature (h, w) that is high on them.
         """
         learned = []
         for colour in colours:
@@ -154,15 +147,19 @@ class Searcher:
         if all(seen is colour for seen, colour in zip(learned, colours)):
             return known, colours
         return self.strips({
-            colour.name: unseen(part, colour.name) if seen is colour else mask_of(part, seen)
+            colour.name: mask_of(
+                contrast_of(part, colour.name) if seen is colour else feature_of(part, seen))
             for seen, colour in zip(learned, colours)}), tuple(learned)
 
     def _mask(self, part: NDArray[np.uint8], colour: str) -> Mask:
-        options = self._options
-        if options.threshold == 'hsv':
+        if self._options.threshold == 'hsv':
             return hsv_mask(part, colour)
-        return chromatic_mask(
-            part, colour, options.noise_gate, options.least_contrast, self._window)
+        return self._raised(part, contrast_of(part, colour))
+
+    def _raised(self, part: NDArray[np.uint8], feature: Mask) -> Mask:
+        options = self._options
+        return raised_mask(
+            feature, brightness(part), options.noise_gate, options.least_contrast, self._window)
 
     def _faint(self, feature: Mask) -> Mask:
         return faint_line_mask(
@@ -177,9 +174,9 @@ class Searcher:
                 blobs, self._floor, self._widths[colour], colour, longest=self._longest))
         return tuple(sorted(found, key=lambda s: -s.weight))
 
-    def candidates(self, segments: Strips, told: Told | None = None) -> Candidates:
-        """Poses that explain the strips; of too many those where it is told."""
-        return self._associator.candidates(segments, told)
+    def candidates(self, segments: Strips, gate: Gate | None = None) -> Candidates:
+        """Poses that explain the strips; of too many those inside the gate."""
+        return self._associator.candidates(segments, gate)
 
     def taken_for(self, pose: Pose2, segments: Strips) -> list[FittedCandidate]:
         """What a pose may be taken for in a coarse image."""

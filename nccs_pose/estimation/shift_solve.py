@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import NamedTuple
 
 from nccs_pose.estimation.common_errors import common_variance, sums_of_neighbours
 from nccs_pose.estimation.refine import Refinement
@@ -47,6 +48,13 @@ _FOUND = 1.0
 _ONE = np.eye(6)
 
 
+class Prior(NamedTuple):
+    """A pose that is weighed in like a measurement, T_map_base, and its information (3, 3)."""
+
+    pose: Pose2
+    information: Array
+
+
 @dataclass(frozen=True, eq=False)
 class WeighedShifts:
     """What N shifts say of the pose by the weights that they have been given.
@@ -61,8 +69,7 @@ class WeighedShifts:
     :ivar first: the first of each sum of neighbours whose errors are looked at together (G,).
     :ivar known: information about the unknowns beforehand (K, K).
     :ivar told: that times what is expected of them (K,).
-    :ivar image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift
-        it by (N, 2), px; None where that is nothing.
+    :ivar image_sigma: as of :func:`weigh_shifts`.
     """
 
     start: Pose2
@@ -129,10 +136,9 @@ def weigh_shifts(
     label: NDArray[np.intp],
     start: Pose2,
     *,
-    prior: tuple[Pose2, Array] | None = None,
+    prior: Prior | None = None,
     attitude_sigma: tuple[float, float] = (0.0, 0.0),
-    image_shift: Array | None = None,
-    calibration_sigma: float = 0.0,
+    image_sigma: Array | None = None,
 ) -> WeighedShifts:
     """Weigh N measured shifts by how well they agree on a step of the pose.
 
@@ -154,11 +160,11 @@ def weigh_shifts(
     :param group: of neighbours that each belongs to (N,), those of a group together.
     :param label: map line of each (N,), ascending, along each line in order.
     :param start: the predicted pose, T_map_base.
-    :param prior: a pose with its information (3, 3), weighed in like a measurement.
+    :param prior: what is known of the pose beforehand.
     :param attitude_sigma: how well the base's height is known to keep its plane, metres, and its
         roll and pitch, rad; what is known to zero is held.
-    :param image_shift: d(shift)/d(u, v) of the whole image (N, 2).
-    :param calibration_sigma: what the calibration may shift the whole image by, px.
+    :param image_sigma: d(shift)/d(u, v) of the whole image times what the calibration may shift it
+        by (N, 2), px; None where that is nothing.
     """
     free, known, told = _prior(start, prior, attitude_sigma)
     rows = np.empty((len(free) + 1, len(shift)))
@@ -169,9 +175,6 @@ def weigh_shifts(
     square = _robust(np.add.reduceat(rows, first, axis=1) / np.sqrt(members), known, told)
     inlier = (square <= GATE**2).repeat(members)
     root = np.maximum(1.0 - square / _FORGOTTEN**2, _NOTHING).repeat(members)
-    image_sigma = None
-    if calibration_sigma > 0.0 and image_shift is not None:
-        image_sigma = calibration_sigma * image_shift
     return WeighedShifts(
         start, free, rows[:-1], sigma, root, inlier, label, sums_of_neighbours(first, label),
         known, told, image_sigma)
@@ -205,7 +208,7 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
 
 
 def _prior(
-    start: Pose2, prior: tuple[Pose2, Array] | None, attitude_sigma: tuple[float, float],
+    start: Pose2, prior: Prior | None, attitude_sigma: tuple[float, float],
 ) -> tuple[NDArray[np.intp], Array, Array]:
     """Free unknowns, the information about them (K, K), and that times their expected step (K,).
 
@@ -214,9 +217,8 @@ def _prior(
     free, vague = _unknowns(*attitude_sigma)
     information, told = vague.copy(), np.zeros(len(free))
     if prior is not None:
-        pose, known = prior
-        information[:3, :3] += known
-        told[:3] = known.dot(pose.minus(start))
+        information[:3, :3] += prior.information
+        told[:3] = prior.information.dot(prior.pose.minus(start))
     return free, information, told
 
 

@@ -31,8 +31,8 @@ from nccs_pose.estimation.rivals import DOUBTS, Rivals
 from nccs_pose.estimation.verdict import misses_lines, Objection
 from nccs_pose.geometry.pose import Pose2
 
-# Where nothing is told of the pose, the search of an image ends after so many candidates that do
-# not hold: in all of seven hundred first images that showed a pose it was one of these.
+# Without a gate the search of an image ends after so many candidates that do not hold: in all of
+# seven hundred first images that showed a pose it was one of these.
 _IN_VAIN = 4
 # Only candidates that score this fraction of the best, or are where the robot should be, are laid
 # on the image: one that holds is the best by strips or nearly so (a thousand that held had 0.93 of
@@ -41,7 +41,7 @@ _WORTH_TRYING = 0.75
 
 
 class Sifter:
-    """Lays poses on images of one rig and map."""
+    """Finds the poses that hold on images of one rig and map."""
 
     def __init__(
         self, aligner: Aligner, judge: Judge, rivals: Rivals, symmetries: tuple[Pose2, ...],
@@ -59,16 +59,16 @@ class Sifter:
 
     def sift(self, case: Case, hypotheses: Sequence[Hypothesis]) -> Sifted:
         """Lay hypotheses, the best candidates and their twins on an image."""
-        candidates, told = case.sight.candidates, case.told
-        if told is not None and len(candidates) > TRIED:
-            candidates = tuple(sorted(candidates, key=lambda c: not told.holds(c.pose)))
+        candidates, gate = case.sight.candidates, case.gate
+        if gate is not None and len(candidates) > TRIED:
+            candidates = tuple(sorted(candidates, key=lambda c: not gate.contains(c.pose)))
         ledger = Ledger(
-            self._symmetries, told, self._options.ambiguity_ratio, candidates[TRIED:],
+            self._symmetries, gate, self._options.ambiguity_ratio, candidates[TRIED:],
             case.sight.others)
         starts = deque(Start(h.pose, self._options.band) for h in hypotheses)
         for c in candidates[:TRIED]:
             if c.score >= _WORTH_TRYING * case.sight.promise or (
-                    told is not None and told.holds(c.pose)):
+                    gate is not None and gate.contains(c.pose)):
                 starts.append(Start.of(c))
             else:
                 ledger.pass_over(c)
@@ -77,23 +77,23 @@ class Sifter:
             start = starts.popleft()
             if ledger.knows(start.pose):
                 continue
-            if start.strips is not None and ledger.beats(start.strips):
-                ledger.pass_over(start.strips)
+            if start.candidate is not None and ledger.beats(start.candidate):
+                ledger.pass_over(start.candidate)
                 continue
-            if undecided or (in_vain >= _IN_VAIN and told is None):
+            if undecided or (in_vain >= _IN_VAIN and gate is None):
                 # What the image shows of the hypotheses is among the candidates.
-                if start.strips is not None:
-                    ledger.leave(start.strips)
+                if start.candidate is not None:
+                    ledger.leave(start.candidate)
                 continue
             tried = self._tried(case, start, ledger)
             if isinstance(tried, Found):
                 starts += (Start(twin, SEARCH_BAND)
-                           for twin in ledger.hold(tried, start.strips))
+                           for twin in ledger.hold(tried, start.candidate))
                 undecided = self._is_undecided(case, ledger)
                 continue
             if tried is not None and not tried.is_sharp:
                 starts.extendleft(self._rivals.taken_for(case, tried))
-            if start.strips is not None and ledger.best is None:
+            if start.candidate is not None and ledger.best is None:
                 in_vain += 1
         return ledger.closed()
 
@@ -102,14 +102,14 @@ class Sifter:
 
         What came of one that does not hold is in the ledger.
         """
-        if case.prediction is None and start.strips is not None:
-            against = self._judge.beforehand(start.strips, self._aligner.lines_in_view)
+        if case.prediction is None and start.candidate is not None:
+            against = self._judge.beforehand(start.candidate, self._aligner.lines_in_view)
             if against is not None:
-                ledger.rule_out(start.strips, against)
+                ledger.rule_out(start.candidate, against)
                 return None
         verdict = self._again(case, start, ledger) or self._verdict(case, start, ledger)
         if verdict is None or verdict[1] not in DOUBTS:
-            ledger.begin(start.pose)
+            ledger.settle_twins(start.pose)
         if verdict is None:
             return None
         alignment, found = verdict
@@ -127,7 +127,7 @@ class Sifter:
     def _is_undecided(self, case: Case, ledger: Ledger) -> bool:
         """Whether an image decides nothing between poses that hold, nor does anything else."""
         best = ledger.best
-        return best is not None and case.told is None and (
+        return best is not None and case.gate is None and (
             ledger.is_tied() or self._rivals.are_many(best, case.sight.candidates))
 
     def _verdict(
@@ -151,7 +151,7 @@ class Sifter:
             expected = self._expected(case, alignment)
             found = self._unless_doubtful(case, ledger, self._judge.found(
                 sight.image, alignment, sight.segments, case.history, expected=expected,
-                strips=start.kept(alignment.pose)), expected)
+                candidate=start.kept(alignment.pose)), expected)
             verdict = alignment, found
             if isinstance(found, Found) or not self._judge.may_miss(alignment, found):
                 break
@@ -176,7 +176,7 @@ class Sifter:
             expected = self._expected(case, alignment)
             found = self._judge.by_strips(
                 alignment, case.sight.segments, expected=expected,
-                strips=start.kept(alignment.pose))
+                candidate=start.kept(alignment.pose))
             return alignment, self._unless_doubtful(case, ledger, found, expected)
         return None
 

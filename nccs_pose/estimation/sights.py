@@ -16,15 +16,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from nccs_pose.estimation.association import ALL_STRIPS, FittedCandidate
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.frame import Frame
+from nccs_pose.estimation.gate import Gate
 from nccs_pose.estimation.ledger import AS_MUCH
 from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.estimation.search import Searcher
-from nccs_pose.estimation.told import Told
 from nccs_pose.vision.colour import LineColour
 import numpy as np
 from numpy.typing import NDArray
@@ -83,8 +84,8 @@ class Sight:
 
 
 def sights(
-    image: NDArray[np.uint8], searcher: Searcher, colours: tuple[LineColour, ...], in_vain: int,
-    told: Told | None, lap: Callable[[str], None],
+    frame: Frame, searcher: Searcher, colours: tuple[LineColour, ...], gate: Gate | None, *,
+    in_vain: int,
 ) -> Iterator[Sight]:
     """Look at an image in one way after the other, for sights on which poses are worth a try.
 
@@ -94,25 +95,23 @@ def sights(
 
     A look costs time: try what it shows before the next is asked for.
 
-    :param image: (H, W, 3) uint8 BGR.
     :param colours: what tapes look like to begin with.
+    :param gate: where the robot is by something else than the image.
     :param in_vain: how many images before this one were searched and showed nothing; from one to
         the next the groups of further looks take turns.
-    :param told: where the robot is by something else than the image.
-    :param lap: is told the name of each stage that ends.
     """
     groups = searcher.further
     further = groups[in_vain % len(groups)] if groups else ()
     best: Sight | None = None
     tried: list[Sight] = []
-    view = searcher.view(image)
+    view = searcher.view(frame.image)
     for look in (searcher.first, *further):
         segments, shown = look(view, best.segments if best is not None else (), colours)
         if best is not None and segments is best.segments:
             continue
-        lap('detect')
-        sight = Sight(image, segments, *searcher.candidates(segments, told), shown)
-        lap('associate')
+        frame.watch.lap('detect')
+        sight = Sight(frame.image, segments, *searcher.candidates(segments, gate), shown)
+        frame.watch.lap('associate')
         if best is None or sight.promise > best.promise:
             best = sight
         elif shown is not colours:

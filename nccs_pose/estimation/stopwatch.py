@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 
-from nccs_pose.estimation.estimate import StageTimes
+from nccs_pose.estimation.estimate import Stage, StageTimes
 
 
 class Stopwatch:
@@ -27,10 +27,10 @@ class Stopwatch:
     def __init__(self) -> None:
         """Start."""
         self._last = time.perf_counter()
-        self._seconds: dict[str, float] = {}
+        self._seconds: dict[Stage, float] = {}
 
-    def lap(self, stage: str) -> None:
-        """End a stage, by its name in StageTimes; a stage may have several laps."""
+    def lap(self, stage: Stage) -> None:
+        """End a stage; it may have several laps."""
         now = time.perf_counter()
         self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
         self._last = now

@@ -20,6 +20,7 @@ from functools import cached_property
 import math
 
 from nccs_pose.estimation.floor_segments import FloorSegment
+from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.geometry.floor_table import as_complex, Complex
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array
@@ -120,14 +121,11 @@ class StripLines:
         return fits
 
 
-def poses_of_pairs(
-    strips: StripLines, lines: FloorLines, most: int,
-) -> tuple[Complex, Complex]:
+def poses_of_pairs(strips: StripLines, lines: FloorLines, most: int) -> Poses:
     """Poses that lay a pair of strips on a pair of map lines, those of the heaviest strips first.
 
     :param strips: the heaviest first.
     :param most: only so many pairs that cross are laid.
-    :returns: the poses' rotations, unit (H,), and places (H,).
     """
     a, b, turn = lines.crossings
     count = len(strips.length)
@@ -145,7 +143,7 @@ def poses_of_pairs(
     match &= (apart > near) & (apart < far)
     pair, crossing = np.nonzero(match)
     if len(pair) == 0:
-        return np.zeros(0, complex), np.zeros(0, complex)
+        return Poses.of(())
     found, laid = [], 0
     # Whole pairs of strips: any of them may be the one that is not what it seems.
     ends = np.flatnonzero(pair[1:] > pair[:-1]) + 1
@@ -153,17 +151,17 @@ def poses_of_pairs(
     for part in np.split(np.arange(len(pair)), cuts):
         one, other = first[pair[part]], second[pair[part]]
         found.append(_laid(strips, one, other, lines, a[crossing[part]], b[crossing[part]]))
-        laid += len(found[-1][0])
+        laid += len(found[-1])
         if laid > _ENOUGH:
             break
-    rotations, places = (np.concatenate(parts) for parts in zip(*found))
-    return rotations, places
+    return Poses(np.concatenate([poses.rotation for poses in found]),
+                 np.concatenate([poses.place for poses in found]))
 
 
 def _laid(
     strips: StripLines, first: NDArray[np.intp], second: NDArray[np.intp], lines: FloorLines,
     a: NDArray[np.intp], b: NDArray[np.intp],
-) -> tuple[Complex, Complex]:
+) -> Poses:
     """Poses that put K strips' middles on lines a and b (K,), where the extents agree."""
     strip, line = np.array([first, second]), np.array([a, b])
     direction = lines.direction[line]
@@ -183,4 +181,4 @@ def _laid(
                + np.maximum(along + half - lines.length[line], 0.0))
     # Something in line with a tape may have been joined to it.
     good = (outside < BEYOND + 2.0 * _JOINED * half).all(axis=1)
-    return rotation[:, 0][good], place[:, 0][good]
+    return Poses(rotation[:, 0][good], place[:, 0][good])

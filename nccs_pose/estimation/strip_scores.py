@@ -69,7 +69,7 @@ class StripScorer:
         self._points = (strips.start[:, None] + (
             strips.length * strips.direction)[:, None] * share).ravel()
         self._weight = np.repeat(weight / weight.sum() / _SAMPLES, _SAMPLES)
-        tolerance = 0.06 + 1.5 * footprint
+        tolerance = np.array([s.tolerance for s in segments])
         self._tolerance = np.repeat(tolerance, _SAMPLES)
         self._pixels_per_metre = np.repeat(pitch / np.maximum(footprint, 1e-9), _SAMPLES)
         self._layer = np.repeat(seen.nearest.layers(strips.colour), _SAMPLES)
@@ -96,7 +96,7 @@ class StripScorer:
         """Fraction of the strips' pixels on map lines (H,), by one sample out of ``step``."""
         on = np.concatenate([
             self._on_lines(poses[k:k + _AT_ONCE], step)[0]
-            for k in range(0, max(len(poses.place), 1), _AT_ONCE)])
+            for k in range(0, max(len(poses), 1), _AT_ONCE)])
         weight = self._weight[step // 2::step]
         return on @ (weight / weight.sum())
 
@@ -124,7 +124,7 @@ class StripScorer:
                 begin[ones], length[ones], along[ones], share))
         else:
             total, covered = self._seen(begin, length, along, share)
-        count = len(poses.place)
+        count = len(poses)
         return np.bincount(pose, covered, count) / np.maximum(
             np.bincount(pose, total, count), 1e-9)
 
@@ -162,7 +162,7 @@ class StripScorer:
         some = slice(step // 2, None, step)
         tolerance, points, share = self._tolerance[some], self._points[some], self._weight[some]
         inverse, share = 1.0 / tolerance, share / share.sum()
-        rows = np.empty((len(poses.place), 4, len(inverse)))
+        rows = np.empty((len(poses), 4, len(inverse)))
         for _ in range(rounds):
             on, which, across = self._on_lines(poses, step)
             weight = on * inverse

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether a pose that was laid on an image may be believed."""
+"""What its measurements, and the strips of its image, say against a pose that was laid there."""
 
 from __future__ import annotations
 
@@ -32,8 +32,6 @@ _RESTS = 0.25
 # (m) is that line, moved.
 _PARALLEL = 0.12
 _NEAR = 0.6
-# A strip closer than this to a map line lies on it, metres beyond its own footprint.
-_ON = 0.06
 # A whole line lies off its place when its mean is this many standard deviations from zero; and by
 # more than what surrounds a tape shifts it, the more the thinner it is: this over its width, px^2.
 _EVIDENT = 7.0
@@ -93,8 +91,8 @@ def objection(
         if off is not None:
             k, offset = off
             return Objection(
-                f'{_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not fit '
-                'the image', line=k)
+                f'{line_name(line_map, k)} lies {offset:.1f} px off: the rig or the map does not '
+                'fit the image', line=k)
     used = lines_used(alignment)
     if is_suspect(alignment) and (used < 4 or not expected):
         size = alignment.residual_px
@@ -115,14 +113,17 @@ def misses_lines(alignment: Alignment) -> bool:
 
 def is_weak(alignment: Alignment) -> bool:
     """Whether a pose rests on so little, or fits so badly, that it has to be where expected."""
-    scale, size = alignment.scale, alignment.residual_px
-    times, least = _UNLIKE_NOISE[1]
-    return lines_used(alignment) < 3 or (scale > times and size > least)
+    return lines_used(alignment) < 3 or _is_unlike_noise(alignment, 3)
 
 
 def is_suspect(alignment: Alignment) -> bool:
     """Whether a pose fits so badly that its lines may be other ones."""
-    times, least = _UNLIKE_NOISE[min(max(lines_used(alignment), 2), 4) - 2]
+    return _is_unlike_noise(alignment, lines_used(alignment))
+
+
+def _is_unlike_noise(alignment: Alignment, lines: int) -> bool:
+    """Whether the residuals of a pose on so many lines are larger than noise makes them."""
+    times, least = _UNLIKE_NOISE[min(max(lines, 2), 4) - 2]
     return alignment.scale > times and alignment.residual_px > least
 
 
@@ -163,7 +164,8 @@ def line_offsets(alignment: Alignment, lines: int) -> tuple[Array, Array]:
     return mean, np.sqrt(np.maximum(scatter / count, 1.0) / total)
 
 
-def _name(line_map: LineMap, k: int) -> str:
+def line_name(line_map: LineMap, k: int) -> str:
+    """A line of the map in words."""
     return f'line {line_map[k].name or f"number {k}"}'
 
 
@@ -184,7 +186,7 @@ def contradiction(
             offset = _beside(strip, alignment.pose, line_map[k])
             if offset is not None:
                 return Objection(
-                    f'{_name(line_map, k)} is seen {offset:.2f} m beside its place in the map',
+                    f'{line_name(line_map, k)} is seen {offset:.2f} m beside its place in the map',
                     by_strips=True)
     return None
 
@@ -213,7 +215,7 @@ def _lie_on_map(
     x, y = line_map.directions[:, :2].T
     along = offset[..., 0] * x + offset[..., 1] * y
     across = np.abs(offset[..., 1] * x - offset[..., 0] * y).max(axis=1)
-    near = _ON + 1.5 * np.array([strip.footprint for strip in segments])
+    near = np.array([strip.tolerance for strip in segments])
     on = (across < near[:, None]) & (along.max(axis=1) > 0.0) & (
         along.min(axis=1) < line_map.lengths)
     return np.asarray(on.any(axis=1))

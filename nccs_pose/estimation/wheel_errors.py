@@ -84,13 +84,13 @@ class WheelErrors:
 
     def after(self, track: Track) -> WheelErrors:
         """What is known after one more image that fixes every direction of the pose."""
-        begin, wheels = self.begin, track.odometry
-        if begin is None or begin.odometry is None or wheels is None:
+        begin, wheels = self.begin, track.wheels
+        if begin is None or begin.wheels is None or wheels is None:
             return self.begun_at(track)
-        way, turn = wheels.way - begin.odometry.way, wheels.turn - begin.odometry.turn
+        way, turn = wheels.way - begin.wheels.way, wheels.turn - begin.wheels.turn
         if way < _STEP and turn < _STEP:
             return self
-        predicted = by_odometry(begin.pose, begin.covariance, begin.odometry, wheels)
+        predicted = by_odometry(begin.pose, begin.covariance, begin.wheels, wheels)
         x, y = predicted.pose.x - begin.pose.x, predicted.pose.y - begin.pose.y
         length = math.hypot(x, y) or 1.0
         x, y = x / length, y / length

@@ -185,12 +185,17 @@ def checked_rotation(rotation: ArrayLike) -> Array:
     return u @ vt
 
 
+def cross_matrix(vector: Array) -> Array:
+    """The matrix (3, 3) that turns b into vector x b."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def rotation_exp(vector: ArrayLike) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
     vector = np.asarray(vector, dtype=float)
     angle = float(np.linalg.norm(vector))
-    k = np.array([
-        [0.0, -vector[2], vector[1]], [vector[2], 0.0, -vector[0]], [-vector[1], vector[0], 0.0]])
+    k = cross_matrix(vector)
     # sinc keeps both series exact through angle = 0.
     a = np.sinc(angle / math.pi)
     b = 0.5 * np.sinc(0.5 * angle / math.pi) ** 2

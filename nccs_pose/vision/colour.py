@@ -39,12 +39,18 @@ CONTRASTS: dict[str, tuple[float, float, float]] = {
 # The contrast of a tape that no image has shown yet, grey levels: so faint that what is asked for
 # in parts of it binds only once one has.
 _UNSEEN = 10.0
+# Nor has any shown how the floor varies: in its brightness, and in every channel by itself.
+_SHADE = 20.0
+_NOISE = 2.0
 # A learned contrast further than this from its class, or fainter (grey levels), is not that
 # colour.
 _DRIFT_COSINE = 0.5
 _LEAST_CONTRAST = 3.0
 # A contrast is learned when its mean is this many times its standard error.
 _EVIDENT = 4.0
+# It is learned from stations that show this part of the usual one, and from no fewer than these.
+_LEAST_SHARE = 0.3
+_LEAST_STATIONS = 10
 # Blur that an image can have, px, and how far one image may change it.
 _BLUR_RANGE = (0.25, 3.0)
 _BLUR_STEP = 0.5
@@ -85,10 +91,9 @@ class LineColour:
             raise VisionError(f'colour {name!r} is not one of {", ".join(CONTRASTS)}')
         direction = np.array(CONTRASTS[name])
         # A coloured tape is told by chromaticity: brightness is what the floor varies in.
-        coloured = abs(direction.sum()) < 1e-9
-        grey = np.full((3, 3), 20.0**2) if coloured else np.zeros((3, 3))
-        return cls.of(
-            name, _UNSEEN * direction / np.linalg.norm(direction), grey + 4.0 * np.eye(3), blur)
+        grey = np.full((3, 3), _SHADE**2) if _is_coloured(name) else np.zeros((3, 3))
+        contrast = _UNSEEN * direction / np.linalg.norm(direction)
+        return cls.of(name, contrast, grey + _NOISE**2 * np.eye(3), blur)
 
     def learn(self, height: Array, power: Array, clutter: Array, floor: Array) -> LineColour:
         """Take over the contrast seen at N stations and the variation that is no tape's.
@@ -107,9 +112,9 @@ class LineColour:
         scatter = power * (along - mean)
         if mean < _EVIDENT * math.sqrt(float(scatter.dot(scatter))) / total:
             return self
-        good = (along > 0.3 * max(upper_median(along), 0.0)).astype(float)
+        good = (along > _LEAST_SHARE * max(upper_median(along), 0.0)).astype(float)
         count = float(good.sum())
-        if count < 10:
+        if count < _LEAST_STATIONS:
             return self
         weight = power * good
         return self.taught(
@@ -133,15 +138,11 @@ class LineColour:
         """
         relative = [c / max(f, 1.0) for c, f in zip(contrast.tolist(), floor.tolist())]
         nominal = CONTRASTS[self.name]
-        if self._coloured:
+        if _is_coloured(self.name):
             brightness = sum(relative) / 3.0
             relative = [value - brightness for value in relative]
         size = math.hypot(*relative) * math.hypot(*nominal)
         return sum(r * n for r, n in zip(relative, nominal)) < _DRIFT_COSINE * size or size == 0.0
-
-    @property
-    def _coloured(self) -> bool:
-        return abs(sum(CONTRASTS[self.name])) < 1e-9
 
     def sharpen(self, height: Array, left: Array, power: Array, unit: float) -> LineColour:
         """Take over the blur seen at N stations.
@@ -164,3 +165,8 @@ class LineColour:
         return LineColour(
             self.name, self.contrast, self.clutter, min(max(self.blur + step, least), most),
             self.discriminant)
+
+
+def _is_coloured(name: str) -> bool:
+    """Whether a class has a hue, which brightness tells nothing of."""
+    return abs(sum(CONTRASTS[name])) < 1e-9

@@ -96,14 +96,14 @@ def decode_image(
     if encoding in _SIXTEEN_BIT:
         channels, order = _SIXTEEN_BIT[encoding]
         colours = high.reshape(height, width, channels)[:, :, order]
-        return _contiguous(np.broadcast_to(colours, (height, width, 3)))
+        return np.ascontiguousarray(np.broadcast_to(colours, (height, width, 3)))
     if encoding in _BAYER_16:
-        return _convert(_contiguous(high), _BAYER_16[encoding], encoding)
+        return _convert(np.ascontiguousarray(high), _BAYER_16[encoding], encoding)
     if semi_planar:
         return _convert(rows, _SEMI_PLANAR[encoding], encoding)
     code = _CONVERSIONS[encoding][1]
     pixels = rows if bytes_a_pixel == 1 else rows.reshape(height, width, bytes_a_pixel)
-    return _contiguous(pixels) if code is None else _convert(pixels, code, encoding)
+    return np.ascontiguousarray(pixels) if code is None else _convert(pixels, code, encoding)
 
 
 def decode_compressed(image_format: str, data: Any) -> Image:
@@ -153,10 +153,6 @@ def _rows(encoding: str, height: int, row_bytes: int, step: int, data: Any) -> I
             f'{encoding} image: data has {size} bytes, not {height} rows x step {step} = '
             f'{step * height}')
     return np.frombuffer(data, np.uint8).reshape(height, step)[:, :row_bytes]
-
-
-def _contiguous(pixels: NDArray[np.uint8]) -> Image:
-    return np.ascontiguousarray(pixels)
 
 
 def _convert(pixels: Image, code: int, encoding: str) -> Image:

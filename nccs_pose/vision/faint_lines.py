@@ -23,8 +23,8 @@ from __future__ import annotations
 import math
 
 import cv2
-from nccs_pose.vision.median import upper_median
-from nccs_pose.vision.segment import Mask
+from nccs_pose.vision.median import noise_deviation, upper_median
+from nccs_pose.vision.segment import Mask, smoothed
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,15 +55,15 @@ def faint_line_mask(feature: Mask, floor: Mask, gate: float, window: int) -> Mas
     :param window: width of the surroundings, px.
     """
     sample = floor[::_SPARSE, ::_SPARSE] > 0
-    height = cv2.GaussianBlur(feature, (3, 3), 0.8).astype(np.float32)
+    height = smoothed(feature).astype(np.float32)
     # A median follows the rim of a thing, beside which a mean would be of both.
     height -= cv2.medianBlur(feature, window | 1)
-    most = _MOST * max(_deviation(height[::_SPARSE, ::_SPARSE][sample]), _ROUNDING[0])
+    most = _MOST * max(noise_deviation(height[::_SPARSE, ::_SPARSE][sample]), _ROUNDING[0])
     np.clip(height, -most, most, out=height)
     shown, going_on = _ridges(height, max(round(_ASIDE * window), _LEAST_ASIDE))
     usual = shown[::_SPARSE, ::_SPARSE][sample]
     middle = upper_median(usual)
-    least = middle + max(gate * _deviation(usual - middle), _ROUNDING[1])
+    least = middle + max(gate * noise_deviation(usual - middle), _ROUNDING[1])
     return cv2.bitwise_and(cv2.compare(going_on, least, cv2.CMP_GT), floor)
 
 
@@ -113,8 +113,3 @@ def _row(angle: float) -> tuple[tuple[float, float], NDArray[np.float32]]:
 
 
 _ROWS = tuple(_row(angle) for angle in (np.arange(_DIRECTIONS) * math.pi / _DIRECTIONS).tolist())
-
-
-def _deviation(values: NDArray[np.float32]) -> float:
-    """The standard deviation about zero of values (N,), those of things apart."""
-    return 1.4826 * upper_median(np.abs(values))

@@ -18,7 +18,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
+
+SIGMA_PER_MEDIAN = 1.4826
+"""The standard deviation of Gaussian noise e over the median of |e|."""
 
 
 def upper_median(values: NDArray[Any]) -> float:
@@ -26,3 +30,8 @@ def upper_median(values: NDArray[Any]) -> float:
     ordered, middle = values.flatten(), values.size // 2
     ordered.partition(middle)
     return float(ordered[middle])
+
+
+def noise_deviation(values: NDArray[Any]) -> float:
+    """Standard deviation about zero of values of any shape, most of which are mere noise."""
+    return SIGMA_PER_MEDIAN * upper_median(np.abs(values))

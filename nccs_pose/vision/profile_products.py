@@ -108,11 +108,6 @@ def _grid(rows: int, count: int) -> NDArray[np.float32]:
     ).reshape(-1, 4).astype(np.float32)
 
 
-def as_complex(points: Array) -> NDArray[np.complex64]:
-    """Points (N, 2) of the image as complex numbers u + iv (N,)."""
-    return np.ascontiguousarray(points, dtype=np.float32).view(np.complex64)[:, 0]
-
-
 def profile_products(
     channels: NDArray[np.uint8] | NDArray[np.float32], s: NDArray[np.float32], half_width: Array,
     across: Array, blur: float, members: int,
@@ -121,7 +116,7 @@ def profile_products(
 
     With left and right the distances from the two edges over the blur, T = Phi(left) - Phi(right)
     is the profile, D = dT/d(delta) and B = dT/d(blur), both times sqrt(2 pi) blur: for shifts and
-    changes of the blur in :func:`unit`; s counts in blurs.
+    changes of the blur in :func:`derivative_unit`; s counts in blurs.
 
     Phi is the normal distribution. Of the edges of a sharp image, which a pixel's square blurs
     more than the lens, it is corrected by Edgeworth's series: a unit square has as seen along a
@@ -219,7 +214,7 @@ def _edgeworth(
     return added
 
 
-def unit(blur: float) -> float:
+def derivative_unit(blur: float) -> float:
     """What a unit of a template's derivative stands for, px."""
     return math.sqrt(2.0 * math.pi) * blur
 

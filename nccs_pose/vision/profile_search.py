@@ -20,8 +20,7 @@ import cv2
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.bands import Bands
 from nccs_pose.vision.colour import LineColour
-from nccs_pose.vision.median import upper_median
-from nccs_pose.vision.profile_products import as_complex
+from nccs_pose.vision.median import noise_deviation
 from nccs_pose.vision.profiles import FOUND, FOUND_FRACTION, ProfileFit
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +49,7 @@ def search_profiles(
     best = pooled.argmax(axis=1)
     rows = np.arange(len(bands))
     # From station to station the tape stays and the noise does not.
-    noise = 1.4826 * upper_median(np.abs(contrast[1:] - contrast[:-1])) / np.sqrt(2.0 * together)
+    noise = noise_deviation(contrast[1:] - contrast[:-1]) / np.sqrt(2.0 * together)
     return ProfileFit(
         offsets[best], np.full(len(bands), 1.0),
         pooled[rows, best] > max(FOUND * noise, FOUND_FRACTION))
@@ -108,12 +107,17 @@ def _sample(
 ) -> NDArray[np.float32]:
     """Image values (N, K, 3) at offsets (K,) across each band, averaged along it."""
     n, k = len(bands), len(offsets)
-    across = as_complex(bands.across)[:, None]
+    across = _as_complex(bands.across)[:, None]
     t = bands.spacing.astype(np.float32) * _ALONG[:, None]
-    on_curve = as_complex(bands.centre) + (
+    on_curve = _as_complex(bands.centre) + (
         (0.5 * bands.bend).astype(np.float32) * t * t - 1j * t) * across[:, 0]
     at = on_curve[..., None] + offsets * across
     values = cv2.remap(
         image, at.view(np.float32).reshape(len(t), n * k, 2), None, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE)
     return cv2.reduce(values, 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F).reshape(n, k, 3)
+
+
+def _as_complex(points: Array) -> NDArray[np.complex64]:
+    """Points (N, 2) of the image as complex numbers u + iv (N,)."""
+    return np.ascontiguousarray(points, dtype=np.float32).view(np.complex64)[:, 0]

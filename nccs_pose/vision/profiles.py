@@ -33,12 +33,12 @@ from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.median import upper_median
 from nccs_pose.vision.profile_products import (
+    derivative_unit,
     products_by_shift,
     profile_products,
     read_pixels,
     Reading,
     SHARP,
-    unit,
 )
 import numpy as np
 from numpy.typing import NDArray
@@ -174,7 +174,7 @@ def _gain(
 
     :param blur: of the template, px.
     """
-    step = unit(blur)
+    step = derivative_unit(blur)
     if rough:
         # A template softer than the edges by so much is felt from further away, and misses less.
         return step * math.sqrt(0.5 * (1.0 + (colour.blur / blur) ** 2)), colour

@@ -22,7 +22,7 @@ import cv2
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
 from nccs_pose.vision.colour import CONTRASTS
-from nccs_pose.vision.median import upper_median
+from nccs_pose.vision.median import noise_deviation, upper_median
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +36,8 @@ _HSV_RANGES: dict[str, tuple[tuple[int, int, int], tuple[int, int, int]]] = {
     'magenta': ((140, 60, 40), (170, 255, 255)),
     'cyan': ((80, 60, 40), (100, 255, 255)),
 }
+# A pixel that rises by less than this over its surroundings, grey levels, may be rounding.
+_LEAST_RISE = 2.0
 # A pixel of a tape has this part of the highest contrast so near.
 _PART_OF_PEAK = 0.45
 _NEAR_PEAK = np.ones((5, 5), np.uint8)
@@ -97,7 +99,7 @@ def raised_mask(
     :param feature: (H, W) uint8, high on tapes.
     :param bright: brightness of the image, grey levels.
     """
-    feature = cv2.GaussianBlur(feature, (3, 3), 0.8)
+    feature = smoothed(feature)
     # Beside a dark thing the floor stands out of the mean of both, but to one side only: a square
     # fits in there. It does in a solid as well, which has to stay one.
     usual = upper_median(feature[::8, ::8])
@@ -106,8 +108,8 @@ def raised_mask(
     around = cv2.max(cv2.blur(feature, (window, window)), cv2.min(opened, usual))
     # Of numbers shorter than 32 bits numpy finds the median in twice the time.
     some = feature[::4, ::4].astype(np.int32) - around[::4, ::4]
-    noise = 1.4826 * upper_median(np.abs(some - int(upper_median(some))))
-    threshold = max(2.0, gate * noise, least * bright)
+    noise = noise_deviation(some - int(upper_median(some)))
+    threshold = max(_LEAST_RISE, gate * noise, least * bright)
     raised = cv2.subtract(feature, around)
     mask = cv2.threshold(raised, threshold, 255.0, cv2.THRESH_BINARY)[1]
     # Over its surroundings a solid would be high at its rim alone, over the floor it is as a
@@ -116,6 +118,11 @@ def raised_mask(
     peak = cv2.convertScaleAbs(
         cv2.dilate(height, _NEAR_PEAK), alpha=_PART_OF_PEAK)
     return cv2.bitwise_and(mask, cv2.compare(height, peak, cv2.CMP_GE))
+
+
+def smoothed(feature: Mask) -> Mask:
+    """A feature with less of the noise of single pixels; a tape a pixel wide stays."""
+    return np.asarray(cv2.GaussianBlur(feature, (3, 3), 0.8))
 
 
 def contrast_of(image: NDArray[np.uint8], colour: str) -> Mask:

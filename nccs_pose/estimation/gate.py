@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where the robot is by something else than the image; it decides between equal poses."""
+"""Where the robot is by something else than the image: that decides between equal poses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from nccs_pose.estimation.alignment import close
-from nccs_pose.geometry.floor_table import Complex
+from nccs_pose.estimation.many_poses import Poses
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.small_matrices import inverse
 import numpy as np
@@ -32,32 +32,29 @@ _GUESSED = np.diag([0.05, 0.05, 0.02])**2
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """A place that a prior or a prediction tells.
+class Gate:
+    """The validation gate about a prior or a prediction: poses that agree with it lie inside.
 
     :ivar pose: T_map_base.
     :ivar covariance: of (x, y, yaw) (3, 3).
-    :ivar gate: how many deviations the robot may be off it.
+    :ivar sigmas: how many deviations the robot may be off it.
     """
 
     pose: Pose2
     covariance: Array
-    gate: float
+    sigmas: float
 
-    def holds(self, pose: Pose2, covariance: Array = _GUESSED) -> bool:
-        """Whether a pose is there, as sure as its own covariance.
+    def contains(self, pose: Pose2, covariance: Array = _GUESSED) -> bool:
+        """Whether a pose lies inside, as sure as its own covariance.
 
         :param covariance: of its (x, y, yaw) (3, 3); unless given, that of a guess by strips.
         """
-        return close(pose, self.pose, self.covariance + covariance, self.gate)
+        return close(pose, self.pose, self.covariance + covariance, self.sigmas)
 
-    def holds_guesses(self, places: Complex, rotations: Complex) -> NDArray[np.bool_]:
-        """Whether poses that strips tell are there (H,).
-
-        :param places: x + iy (H,), metres.
-        :param rotations: unit complex numbers (H,).
-        """
-        off = places - complex(self.pose.x, self.pose.y)
-        off = np.array([off.real, off.imag, np.angle(rotations * np.exp(-1j * self.pose.yaw))])
+    def contains_each(self, poses: Poses) -> NDArray[np.bool_]:
+        """Which of H poses that strips tell lie inside (H,)."""
+        off = poses.place - complex(self.pose.x, self.pose.y)
+        turn = np.angle(poses.rotation * np.exp(-1j * self.pose.yaw))
+        off = np.array([off.real, off.imag, turn])
         information = inverse(self.covariance + _GUESSED)
-        return np.einsum('ih,ij,jh->h', off, information, off) <= self.gate**2
+        return np.einsum('ih,ij,jh->h', off, information, off) <= self.sigmas**2
