@@ -713,6 +713,24 @@ def test_wheels_of_another_size_are_no_surer_in_the_dark_than_images_have_shown(
         assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
 
 
+@pytest.mark.parametrize('slip', [-0.2, 0.2])
+def test_a_slip_in_the_dark_does_not_end_in_the_next_cell(slip: float) -> None:
+    """Wheels that lose or gain half a cell by slipping leave the robot's place open."""
+    drive = Drive(replace(SCENE, line_map=CELLS), Pose2(-2.2, 0.3, 0.2))
+    step, slipped = Pose2(0.15, 0.0, 0.0), Pose2(0.15 * slip, 0.0, 0.0)
+    drive.localiser.set_prior(drive.pose @ step, np.diag([0.05, 0.05, 0.05]) ** 2)
+    for _ in range(3):
+        assert drive.right(drive.go(step))
+    for _ in range(19):
+        dark = drive.go(step, slipped, change=_black)
+        if dark.pose is not None:
+            error = drive.error(dark)
+            assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
+    for _ in range(4):
+        back = drive.go(step)
+        assert back.pose is None or drive.right(back)
+
+
 @pytest.mark.parametrize('leap', [
     Pose2(0.3, 0.0, 0.0), Pose2(-0.5, 0.5, 0.6), Pose2(0.0, 0.0, 1.5)])
 def test_what_wheels_leap_is_not_coasted_over(leap: Pose2) -> None:
