@@ -44,6 +44,7 @@ from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
+from nccs_pose.simulation.large_maps import lattice
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
@@ -805,6 +806,17 @@ def test_a_pose_that_explains_less_than_another_is_given_up() -> None:
     # From then on no image is laid on the twin again.
     for _ in range(6):
         assert drive.right(drive.go(Pose2(0.02, 0.0, 0.0)))
+
+
+def test_a_pose_is_kept_where_strips_alone_show_more_of_the_edge_of_the_map() -> None:
+    """Far lines are measured, but too thin for strips; at the edge there would be none."""
+    step = Pose2(0.05, 0.0, 0.03)
+    drive = Drive(_plain(lattice()), Pose2(0.73, 0.44, 0.7))
+    drive.localiser.set_prior(drive.pose @ step, np.diag([0.05, 0.05, 0.03]) ** 2)
+    answers = [drive.go(step) for _ in range(14)]
+    tracked = [answer.state is State.TRACKING for answer in answers]
+    assert all(tracked[tracked.index(True):])
+    assert drive.right(answers[-1])
 
 
 # ---------------------------------------------------------------- places that look the same

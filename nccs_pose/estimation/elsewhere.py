@@ -16,11 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import islice
 
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment, leaves_open
-from nccs_pose.estimation.association import Candidates
+from nccs_pose.estimation.association import Candidates, FittedCandidate
 from nccs_pose.estimation.case import SEARCH_BAND
 from nccs_pose.estimation.judge import fit_of
 from nccs_pose.estimation.ledger import Refused
@@ -89,21 +90,42 @@ class Elsewhere:
             # Without the alignment, which others would have to beat by what they explain.
             return Refused(FITS_ELSEWHERE)
         vague = prediction.is_vague
-        here, _ = self._searcher.score(alignment.pose, segments)
+        here, claimed = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
             return None
         gate = min(_GATE, self._options.innovation_gate)
         told = Told(prediction.pose, prediction.covariance, gate)
         found = self._searcher.candidates(segments, told if vague else None)
-        best = found.fitted[0] if found.fitted else None
-        if best is not None and best.score > here + BETTER and not same_pose(
-                best.pose, alignment.pose):
+        better = (c for c in found.fitted if c.score > here + BETTER)
+        if self._explains_more(image, alignment, claimed, islice(better, _TRIED)):
             return Refused(_ANOTHER, alignment)
         if vague and (self._shows_as_much(found, alignment, here, told)
                       or self._is_one_of_parallels(image, alignment, prediction, told)):
             # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
+
+    def _explains_more(
+        self, image: NDArray[np.uint8], alignment: Alignment, claimed: float,
+        others: Iterable[FittedCandidate],
+    ) -> bool:
+        """Whether one of the poses of which strips show more does so on the image as well.
+
+        Strips miss what is far or thin, so that of a map with many lines they show most where it
+        has fewest: from its edge.
+
+        :param claimed: which part of the strips the pose itself explains.
+        """
+        least = min(claimed, alignment.explained) + BETTER
+        for strips in others:
+            if strips.claimed <= least or same_pose(strips.pose, alignment.pose):
+                continue
+            other = self._aligner.align(
+                image, strips.pose, alignment.colours, reach=SEARCH_BAND)
+            if other is not None and other.explained > least and not same_pose(
+                    other.pose, alignment.pose):
+                return True
+        return False
 
     def _fits_better(
         self, image: NDArray[np.uint8], alignment: Alignment, segments: Strips,
