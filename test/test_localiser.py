@@ -45,6 +45,7 @@ from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
+from nccs_pose.simulation.large_maps import lattice
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
@@ -715,6 +716,24 @@ def test_wheels_of_another_size_are_no_surer_in_the_dark_than_images_have_shown(
         assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
 
 
+@pytest.mark.parametrize('slip', [-0.2, 0.2])
+def test_a_slip_in_the_dark_does_not_end_in_the_next_cell(slip: float) -> None:
+    """Wheels that lose or gain half a cell by slipping leave the robot's place open."""
+    drive = Drive(replace(SCENE, line_map=CELLS), Pose2(-2.2, 0.3, 0.2))
+    step, slipped = Pose2(0.15, 0.0, 0.0), Pose2(0.15 * slip, 0.0, 0.0)
+    drive.localiser.set_prior(drive.pose @ step, np.diag([0.05, 0.05, 0.05]) ** 2)
+    for _ in range(3):
+        assert drive.right(drive.go(step))
+    for _ in range(19):
+        dark = drive.go(step, slipped, change=_black)
+        if dark.pose is not None:
+            error = drive.error(dark)
+            assert error @ np.linalg.solve(dark.covariance, error) < 3.0**2
+    for _ in range(4):
+        back = drive.go(step)
+        assert back.pose is None or drive.right(back)
+
+
 @pytest.mark.parametrize('leap', [
     Pose2(0.3, 0.0, 0.0), Pose2(-0.5, 0.5, 0.6), Pose2(0.0, 0.0, 1.5)])
 def test_what_wheels_leap_is_not_coasted_over(leap: Pose2) -> None:
@@ -789,6 +808,17 @@ def test_a_pose_that_explains_less_than_another_is_given_up() -> None:
     # From then on no image is laid on the twin again.
     for _ in range(6):
         assert drive.right(drive.go(Pose2(0.02, 0.0, 0.0)))
+
+
+def test_a_pose_is_kept_where_strips_alone_show_more_of_the_edge_of_the_map() -> None:
+    """Far lines are measured, but too thin for strips; at the edge there would be none."""
+    step = Pose2(0.05, 0.0, 0.03)
+    drive = Drive(_plain(lattice()), Pose2(0.73, 0.44, 0.7))
+    drive.localiser.set_prior(drive.pose @ step, np.diag([0.05, 0.05, 0.03]) ** 2)
+    answers = [drive.go(step) for _ in range(14)]
+    tracked = [answer.state is State.TRACKING for answer in answers]
+    assert all(tracked[tracked.index(True):])
+    assert drive.right(answers[-1])
 
 
 # ---------------------------------------------------------------- places that look the same

@@ -26,6 +26,7 @@ from nccs_pose.estimation.motion import (
     by_velocity,
     PAST,
     Prediction,
+    Slip,
     Track,
 )
 from nccs_pose.estimation.odometry import Odometry, Wheels
@@ -536,10 +537,40 @@ def test_what_wheels_erred_by_once_is_forgotten_on_the_way() -> None:
 
 def test_wheels_that_no_image_confirms_are_vague_after_a_while() -> None:
     course = Course().after(0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
-    for way, vague in ((0.1, False), (1.2, True)):
+    for way, vague in ((0.1, (False, False)), (0.95, (False, True)), (1.2, (True, True))):
         wheels = Wheels(Pose2(way, 0.0, 0.0), way)
         sure, doubted = (
             course.at(SECOND, wheels, doubted=doubted) for doubted in (False, True))
         assert sure is not None and doubted is not None
-        assert not sure.is_vague
-        assert doubted.is_vague is vague
+        assert (sure.is_vague, doubted.is_vague) == vague
+
+
+@pytest.mark.parametrize('slip', [-0.2, 0.2])
+@pytest.mark.parametrize('way', [0.1, 0.5, 1.0, 2.5])
+def test_wheels_may_slip_where_no_image_watches_them(way: float, slip: float) -> None:
+    """By a fifth, on a wet floor, on all of the way or while they turn on the spot."""
+    course = Course().after(0, START, 1e-6 * np.eye(3), Wheels(Pose2()), is_fixed=True)
+    for wheels, missed in (
+            (Wheels(Pose2(way, 0.0, 0.0), way), Pose2(slip * way, 0.0, 0.0)),
+            (Wheels(Pose2(0.0, 0.0, way), 0.0, way), Pose2(0.0, 0.0, slip * way))):
+        prediction = course.at(SECOND, wheels)
+        assert prediction is not None
+        error = prediction.pose.minus(START @ wheels.pose @ missed)
+        assert error @ np.linalg.solve(prediction.covariance, error) < 3.0**2
+    # In the blink between two images hardly ever does a slip begin.
+    blink = Wheels(Pose2(0.1, 0.0, 0.0), 0.1)
+    prediction = course.at(SECOND, blink)
+    assert prediction is not None
+    sure = by_odometry(START, 1e-6 * np.eye(3), Wheels(Pose2()), blink)
+    assert np.diag(prediction.carried) == pytest.approx(np.diag(sure.carried), rel=0.15)
+
+
+def test_a_slip_adds_up_however_many_images_fix_nothing_of_it() -> None:
+    zero, steps = np.zeros((3, 3)), np.linspace(0.0, 3.0, 31)
+    wheels = [Wheels(Pose2(x, 0.0, 0.0), 3.0 + x) for x in steps]
+    variance = 0.0
+    for before, after in itertools.pairwise(wheels):
+        variance += by_odometry(
+            START, zero, before, after, 3.0, slip=Slip.POSSIBLE).carried[0, 0]
+    at_once = by_odometry(START, zero, wheels[0], wheels[-1], 3.0, slip=Slip.POSSIBLE).carried
+    assert variance == pytest.approx(at_once[0, 0], rel=1e-9)

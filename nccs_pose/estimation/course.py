@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
-from nccs_pose.estimation.motion import by_odometry, by_velocity, PAST, Prediction, Track
+from nccs_pose.estimation.motion import by_odometry, by_velocity, PAST, Prediction, Slip, Track
 from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.estimation.wheel_errors import UNCHECKED, WheelErrors
 from nccs_pose.geometry.pose import Array, Pose2
@@ -51,9 +51,9 @@ class Course:
         if last is None:
             return None
         if last.wheels is not None and wheels is not None:
-            flaw = self.errors.flaw.doubted() if doubted else self.errors.flaw
             return by_odometry(
-                last.pose, last.covariance, last.wheels, wheels, last.seen_way, flaw)
+                last.pose, last.covariance, last.wheels, wheels, last.seen_way,
+                self.errors.flaw, Slip.LIKELY if doubted else Slip.POSSIBLE)
         return by_velocity(self.past, last, stamp_ns)
 
     def seconds_to(self, stamp_ns: int) -> float:

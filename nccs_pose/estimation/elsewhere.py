@@ -16,11 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import islice
 
 from nccs_pose.estimation.aligner import Aligner
 from nccs_pose.estimation.alignment import Alignment, leaves_open
-from nccs_pose.estimation.association import Candidates
+from nccs_pose.estimation.association import Candidates, FittedCandidate
 from nccs_pose.estimation.case import SEARCH_BAND
 from nccs_pose.estimation.gate import BETTER, Gate
 from nccs_pose.estimation.judge import fit_of
@@ -37,9 +38,10 @@ from nccs_pose.geometry.pose import Array, Pose2
 import numpy as np
 from numpy.typing import NDArray
 
-# Lines across which a pose is laid on the next parallel one are so far apart at least, metres; of
-# those that a prediction leaves open so many are tried, the nearest first.
+# Lines across which a pose is laid on the next parallel one are so far apart at least, metres.
 _APART = 0.1
+# So many other poses are laid on an image: of those across parallel lines the nearest, of those of
+# which strips show more the best.
 _TRIED = 4
 # A place where the robot may be lies within so many deviations of a vague prediction: what that
 # reckons with is the most that a robot does, not what it happens to do.
@@ -90,21 +92,42 @@ class Elsewhere:
             # Without the alignment, which others would have to beat by what they explain.
             return Refused(_FITS_ELSEWHERE, misled=True)
         vague = prediction.is_vague
-        here, _ = self._searcher.score(alignment.pose, segments)
+        here, claimed = self._searcher.score(alignment.pose, segments)
         if not vague and here + BETTER >= 1.0:
             return None
         sigmas = min(_GATE, self._options.innovation_gate)
         gate = Gate(prediction.pose, prediction.covariance, sigmas)
         found = self._searcher.candidates(segments, gate if vague else None)
-        best = found.fitted[0] if found.fitted else None
-        if best is not None and best.score > here + BETTER and not same_pose(
-                best.pose, alignment.pose):
+        better = (c for c in found.fitted if c.score > here + BETTER)
+        if self._explains_more(image, alignment, claimed, islice(better, _TRIED)):
             return Refused(_ANOTHER, alignment)
         if vague and (self._shows_as_much(found, alignment, here, gate)
                       or self._is_one_of_parallels(image, alignment, prediction, gate)):
             # Without the alignment, which others would have to beat: it is no worse than they are.
             return Refused(_AS_WELL)
         return None
+
+    def _explains_more(
+        self, image: NDArray[np.uint8], alignment: Alignment, claimed: float,
+        others: Iterable[FittedCandidate],
+    ) -> bool:
+        """Whether one of the poses of which strips show more does so on the image as well.
+
+        Strips miss what is far or thin, so that of a map with many lines they show most where it
+        has fewest: from its edge.
+
+        :param claimed: which part of the strips the pose itself explains.
+        """
+        least = min(claimed, alignment.explained) + BETTER
+        for candidate in others:
+            if candidate.claimed <= least or same_pose(candidate.pose, alignment.pose):
+                continue
+            other = self._aligner.align(
+                image, candidate.pose, alignment.colours, reach=SEARCH_BAND)
+            if other is not None and other.explained > least and not same_pose(
+                    other.pose, alignment.pose):
+                return True
+        return False
 
     def _fits_better(
         self, image: NDArray[np.uint8], alignment: Alignment, segments: Strips,

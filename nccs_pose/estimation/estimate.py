@@ -60,8 +60,8 @@ class State(Enum):
     COASTING = 'coasting', (
         'The image says too little; the last pose is carried on by odometry, for `coast_time` at '
         'most and up to `coast_sigma`, unless an image shows another place. Its covariance grows '
-        'with all of the way and all of the turns that the wheels have made, and with the time '
-        'in which they were not heard.')
+        'with all of the way and all of the turns that the wheels have made, with what they may '
+        'slip by while no image watches them, and with the time in which they were not heard.')
     LOST = 'lost', (
         'There was a pose, and it neither explains the image nor can be carried on. None is '
         'given.')

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from itertools import pairwise
 import math
@@ -37,7 +38,7 @@ _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
 # Besides, they may be larger or smaller than they are taken for, by this part.
 _SCALE = 0.02
-# Where images speak against what they tell, they may have slipped or spun by this part.
+# Where no image watches them they may slip or spin by this part.
 _SLIP = 0.1
 # Without odometry: the speed and the acceleration that a robot may have, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
@@ -84,9 +85,23 @@ class Flaw:
     turn: float = 0.0
     bend: float = 0.0
 
-    def doubted(self) -> Flaw:
-        """Of wheels against which images speak."""
-        return Flaw(max(self.way, _SLIP), max(self.turn, _SLIP), self.bend)
+
+class Slip(Enum):
+    """Whether wheels may slip on a way that no image watches."""
+
+    NONE = 'what they do is known'
+    POSSIBLE = 'it may begin anywhere on the way, every metre or radian once'
+    LIKELY = 'images speak against what they tell'
+
+    def variance(self, rolled: float) -> float:
+        """What it may add up to, from the beginning of the way on, m^2 or rad^2.
+
+        On a way shorter than a metre or radian it is the less likely, the shorter that is.
+        """
+        if self is Slip.NONE:
+            return 0.0
+        share = min(rolled, 1.0) if self is Slip.POSSIBLE else 1.0
+        return share * (_SLIP * rolled) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +156,7 @@ NO_FLAW = Flaw()
 
 def by_odometry(
     pose: Pose2, covariance: Array, before: Wheels, after: Wheels,
-    seen_way: float | None = None, flaw: Flaw = NO_FLAW,
+    seen_way: float | None = None, flaw: Flaw = NO_FLAW, slip: Slip = Slip.NONE,
 ) -> Prediction:
     """Carry a pose and its covariance on by what the wheels did between two moments.
 
@@ -152,6 +167,7 @@ def by_odometry(
     :param seen_way: how far they had rolled when the pose was last fixed in every direction,
         metres; None for when they were asked first.
     :param flaw: what they are known to err by.
+    :param slip: whether they may slip.
     """
     step = before.pose.inverse() @ after.pose
     moved = pose @ step
@@ -161,9 +177,11 @@ def by_odometry(
     open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
     scale = max(flaw.way, _SCALE) * math.sqrt(distance * (distance + 2.0 * open_way))
     leap, spin = (b - a for a, b in zip(before.leapt, after.leapt))
-    swerve = max(flaw.turn * angle, flaw.bend * distance)
+    slipped = math.sqrt(slip.variance(open_way + distance) - slip.variance(open_way))
+    swerve = math.hypot(
+        max(flaw.turn * angle, flaw.bend * distance), math.sqrt(slip.variance(angle)))
     sigma = math.hypot(
-        _PER_METRE[0] * math.sqrt(distance), scale, faster, leap, spin * distance,
+        _PER_METRE[0] * math.sqrt(distance), scale, slipped, faster, leap, spin * distance,
         0.5 * swerve * distance)
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin,
