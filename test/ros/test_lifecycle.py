@@ -186,7 +186,7 @@ def test_transforms_without_tf2_ros_fail_with_the_reason(world):
     assert node.running()
 
 
-@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_the_node_that_works_on_images(world, arena, how):
     node, user = world.localiser(**ARENA), world.user
     images = user.publisher(Image, 'image')
@@ -198,7 +198,7 @@ def test_signals_end_the_node_that_works_on_images(world, arena, how):
     assert 'Traceback' not in node.output
 
 
-@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_the_node_while_it_starts(world, how):
     caught = [world.localiser(**ROOM) for _ in range(3)]
     # From the program's first line on; among the imports; somewhere before it is active.
@@ -210,7 +210,7 @@ def test_signals_end_the_node_while_it_starts(world, how):
         assert 'Traceback' not in node.output
 
 
-@pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM', 'SIGHUP'])
 def test_a_signal_is_noted_and_ros_stays_up_until_it_is_left(how):
     program = f"""
 import os, signal, time
