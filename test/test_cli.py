@@ -344,6 +344,33 @@ talker:
         make_options(path, [])
 
 
+@pytest.mark.parametrize(('text', 'window'), [
+    ('hall: {robot: {localiser: {ros__parameters: {window: 21}}}}', 21),
+    ('/**: {localiser: {ros__parameters: {window: 21}}, talker: {ros__parameters: {a: 1}}}', 21),
+    ('{hall: {localiser: {ros__parameters: {window: 21}}}, /**: {ros__parameters: {window: 9}}}',
+     9),
+    ('{hall: &hall {door: *hall}, localiser: {ros__parameters: {window: 9}}}', 9),
+    ('hall: &hall {door: *hall, localiser: {ros__parameters: {window: 9}}}', 9)])
+def test_namespaces_may_be_mappings_as_ros_reads_them(
+    tmp_path: Path, text: str, window: int,
+) -> None:
+    path = tmp_path / 'params.yaml'
+    path.write_text(text)
+    assert make_options(path, []).window == window
+
+
+def test_a_parameter_file_of_other_nodes_names_them(tmp_path: Path) -> None:
+    path = tmp_path / 'params.yaml'
+    for text, words in (
+            ('hall: {talker: {ros__parameters: {}}}', 'only parameters of hall.talker'),
+            ('hall: {localiser: {ros_parameters: {}}}', 'only parameters of hall'),
+            ('localiser: {ros_parameters: {}}', 'is localiser.ros_parameters meant?')):
+        path.write_text(text)
+        with pytest.raises(FileError) as refused:
+            make_options(path, [])
+        assert words in str(refused.value)
+
+
 def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture) -> None:
     stamps = 10**18 + np.arange(20) * 10**8
     poses = np.column_stack([np.arange(20), np.zeros(20), np.linspace(-3, 3, 20)])
