@@ -265,6 +265,7 @@ def test_a_bag_of_another_camera_is_refused(drive: Path, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(('change', 'words'), [
     (lambda a: [*a, '--option', 'nonsense=1'], ['nonsense', 'there are']),
+    (lambda a: [*a, '--option', 'reach'], ['--option reach', 'NAME=VALUE']),
     (lambda a: [*a, '--option', 'threshold=guess'], ['threshold', 'guess', 'hsv']),
     (lambda a: [*a, '--option', 'stations=many'], ['stations=many', 'int']),
     (lambda a: [*a, '--output', str(REPO)], [str(REPO), 'folder']),
@@ -479,7 +480,9 @@ def test_what_is_there_is_not_overwritten_by_a_drive(tmp_path: Path, capsys: Cap
 
 @pytest.mark.parametrize('arguments', [
     ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p.tum', '--plots', 'BAD'],
+    ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p', '--plots', 'OUT/p'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'BAD/n.md'],
+    ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'OUT/n.md', '--plots', 'OUT/n.md'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--plots', 'BAD'],
     ['faults', '--output', 'BAD'], ['precision', '--output', 'BAD'],
     ['coverage', '--output', 'BAD/c.md'], ['stages', '--output', 'BAD/s.json'],
