@@ -153,7 +153,9 @@ def image_status(
     :param fresh_refusals: messages refused, or callbacks failed, since the last report.
     :param fresh_lost: images lost by the middleware since the last report.
     """
-    words, level = f'images come on {topic}', DiagnosticStatus.OK
+    words, level = (
+        f'images come on {topic}' if tally.received else f'no image yet on {topic}'
+    ), DiagnosticStatus.OK
     if fresh_lost:
         words, level = (
             f'{fresh_lost} images were lost by the middleware: does the camera use '

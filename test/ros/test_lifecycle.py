@@ -248,6 +248,9 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     def said(words: str) -> bool:
         return words in getattr(user.statuses.get('localiser: images'), 'message', '')
 
+    # That images come is not said before one has.
+    assert user.wait(lambda: 'localiser: images' in user.statuses), node.output
+    assert said('no image yet on /front/image') or said('nothing publishes /front/image')
     assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     assert 'nothing publishes /front/image' in node.output
     user.node.create_publisher(
