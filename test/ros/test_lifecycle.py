@@ -34,7 +34,7 @@ from nccs_pose.ros.conversions import image_message
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
 ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
@@ -253,6 +253,12 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     assert said('no image yet on /front/image') or said('nothing publishes /front/image')
     assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     assert 'nothing publishes /front/image' in node.output
+    compressed = user.node.create_publisher(CompressedImage, '/front/image', 1)
+    assert user.wait(lambda: said(
+        '/front/image is published as sensor_msgs/msg/CompressedImage, but is subscribed as '
+        'sensor_msgs/msg/Image')), node.output
+    user.node.destroy_publisher(compressed)
+    assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     user.node.create_publisher(
         Image, '/front/image', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     assert user.wait(lambda: said(f'set {reliability}')), node.output
