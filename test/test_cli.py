@@ -567,13 +567,33 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: Cap
     assert 'interrupted' in err
 
 
-def test_a_closed_pipe_is_no_traceback(tmp_path: Path) -> None:
+@pytest.mark.parametrize('where', ['| true', '>&-'])
+def test_a_closed_output_is_no_traceback(tmp_path: Path, where: str) -> None:
     write_tum(Trajectory([0], np.zeros((1, 3))), tmp_path / 'a.tum')
     line = f'{sys.executable} -m nccs_pose.cli evaluate {tmp_path}/a.tum {tmp_path}/a.tum'
     run = subprocess.run(
-        ['bash', '-c', f'{line} | true'], cwd=REPO, capture_output=True, text=True)
+        ['bash', '-c', f'{line} {where}'], cwd=REPO, capture_output=True, text=True)
     assert 'Traceback' not in run.stderr
     assert 'Exception' not in run.stderr
+    assert run.returncode == 0
+
+
+@pytest.mark.parametrize('arguments', [
+    ['replay', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'MAP'],
+    ['replay', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'LINK'],
+    ['calibrate', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'RIG'],
+    ['starts', '--map', 'MAP', '--output', 'MAP']])
+def test_what_is_read_is_not_replaced(
+    arguments: list[str], tmp_path: Path, capsys: Capture,
+) -> None:
+    files = {kind: tmp_path / f'{kind}.yaml' for kind in ('RIG', 'MAP', 'LINK')}
+    for kind, path in zip(('RIG', 'MAP'), (ROOM[1], ROOM[3])):
+        shutil.copy(path, files[kind])
+    files['LINK'].symlink_to(files['RIG'])
+    before = files['RIG'].read_text(), files['MAP'].read_text()
+    call = [str(files.get(word, word)) for word in arguments]
+    assert 'cannot be written: it is read' in refusal(capsys, call)
+    assert (files['RIG'].read_text(), files['MAP'].read_text()) == before
 
 
 class Terminal(io.StringIO):

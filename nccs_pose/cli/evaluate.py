@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plots:  # first: the folder that this makes may be what a file is to be
         check_writable(args.plots / 'trajectory.png')
     if args.output:
-        check_writable(args.output)
+        check_writable(args.output, (args.estimated, args.truth, args.map))
     if args.frames is not None and args.frames < len(estimated):
         raise FileError(
             f'--frames {args.frames}: {args.estimated} has more poses, {len(estimated)}.')

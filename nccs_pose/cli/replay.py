@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plots:  # first: the folder that this makes may be what a file is to be
         check_writable(args.plots / 'trajectory.png')
     for path in (args.output, *(_beside(args.output, ending) for ending in _ENDINGS)):
-        check_writable(path)
+        check_writable(path, (args.bag, args.rig, args.map, args.params))
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:
