@@ -481,6 +481,8 @@ def test_what_is_there_is_not_overwritten_by_a_drive(tmp_path: Path, capsys: Cap
 @pytest.mark.parametrize('arguments', [
     ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p.tum', '--plots', 'BAD'],
     ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p', '--plots', 'OUT/p'],
+    ['replay', str(REPO / 'bags/room'), *ROOM, '--output', ''],
+    ['calibrate', str(REPO / 'bags/room'), *ROOM, '--output', '.'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'BAD/n.md'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'OUT/n.md', '--plots', 'OUT/n.md'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--plots', 'BAD'],

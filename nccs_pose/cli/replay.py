@@ -104,8 +104,10 @@ def run(args: argparse.Namespace) -> int:
     frames = odometry_frames(args.params)
     if args.plots:  # first: the folder that this makes may be what a file is to be
         check_writable(args.plots / 'trajectory.png')
-    for path in (args.output, *(_beside(args.output, ending) for ending in _ENDINGS)):
-        check_writable(path, (args.bag, args.rig, args.map, args.params))
+    inputs = (args.bag, args.rig, args.map, args.params)
+    check_writable(args.output, inputs)  # and has a name, beside which there are others
+    for ending in _ENDINGS:
+        check_writable(_beside(args.output, ending), inputs)
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:
