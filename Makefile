@@ -2,7 +2,7 @@
 # make test   the whole test suite (ARGS='-k name' to choose)
 # make lint   style and types
 # make setup  only the virtual environment (.venv), once per change of the requirement files
-# make clean  removes what the others made
+# make clean  removes what the others made: .venv, and out with all that is in it
 #
 # PYTHON=/usr/bin/python3.12 chooses the interpreter, 3.10 to 3.12.
 

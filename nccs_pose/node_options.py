@@ -31,9 +31,10 @@ class NodeOptions:
     """Parameters of the node `localiser` that are no business of the estimator."""
 
     rig_file: str = option(
-        '', doc='Rig calibration (YAML). A relative path is looked for in the share directory.')
+        '', doc='Rig calibration (YAML). A relative path is looked for where the node was '
+        'started, then in the share directory.')
     map_file: str = option(
-        '', doc='Map of the lines (YAML). A relative path is looked for in the share directory.')
+        '', doc='Map of the lines (YAML). A relative path is looked for as of rig_file.')
     image_transport: str = option(
         'raw', choices=('raw', 'compressed'),
         doc='raw subscribes image, compressed subscribes image/compressed.')

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import os
 from pathlib import Path
 
 from calibration_reader import read_calibration
@@ -235,10 +236,18 @@ def test_bags_with_wrong_metadata_are_refused(tmp_path: Path) -> None:
     rewrite_metadata(path, lambda text: '{[')
     assert 'cannot be read' in refusal(path)
     (path / 'metadata.yaml').unlink()
-    assert 'metadata.yaml' in refusal(path)
+    assert 'bag.mcap can be given by itself' in refusal(path)
+    with BagReader(path / 'bag.mcap') as reader:
+        assert reader.image_count() == 2
     assert 'no such bag' in refusal(tmp_path / 'absent')
     (tmp_path / 'a.txt').write_text('no bag')
     assert 'cannot be read' in refusal(tmp_path / 'a.txt')
+    (tmp_path / 'folder').mkdir()
+    assert refusal(tmp_path / 'folder') == ': is no bag: it has no metadata.yaml.'
+    cv2.imwrite(str(tmp_path / 'folder' / '1.png'), PICTURE)
+    assert 'is a folder of images, no bag' in refusal(tmp_path / 'folder')
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    assert 'is no bag: it is a pipe' in refusal(tmp_path / 'pipe.mcap')
 
 
 def test_a_bag_without_images_says_what_it_has(tmp_path: Path) -> None:

@@ -167,6 +167,8 @@ def test_what_cannot_be_calibrated_is_refused_in_a_sentence(drive, files, tmp_pa
               '--map', f'{drive}_map.yaml'], 'the kind of mirror'),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--images', '3'],
              'only 3 of 3 frames'),
+            (['--rig', here, '--map', f'{drive}_map.yaml', '--images', '1'],
+             'too few images to calibrate from: 1, of which 1 show'),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'rough_cop=wide'],
              "'wide' is no float"),
             (['--rig', here, '--map', f'{drive}_map.yaml', '--option', 'tilt=1'],

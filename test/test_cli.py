@@ -265,6 +265,7 @@ def test_a_bag_of_another_camera_is_refused(drive: Path, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(('change', 'words'), [
     (lambda a: [*a, '--option', 'nonsense=1'], ['nonsense', 'there are']),
+    (lambda a: [*a, '--option', 'reach'], ['--option reach', 'NAME=VALUE']),
     (lambda a: [*a, '--option', 'threshold=guess'], ['threshold', 'guess', 'hsv']),
     (lambda a: [*a, '--option', 'stations=many'], ['stations=many', 'int']),
     (lambda a: [*a, '--output', str(REPO)], [str(REPO), 'folder']),
@@ -342,6 +343,33 @@ talker:
     path.write_text('talker: {ros__parameters: {}}')
     with pytest.raises(FileError, match=r'params\.yaml: localiser is missing'):
         make_options(path, [])
+
+
+@pytest.mark.parametrize(('text', 'window'), [
+    ('hall: {robot: {localiser: {ros__parameters: {window: 21}}}}', 21),
+    ('/**: {localiser: {ros__parameters: {window: 21}}, talker: {ros__parameters: {a: 1}}}', 21),
+    ('{hall: {localiser: {ros__parameters: {window: 21}}}, /**: {ros__parameters: {window: 9}}}',
+     9),
+    ('{hall: &hall {door: *hall}, localiser: {ros__parameters: {window: 9}}}', 9),
+    ('hall: &hall {door: *hall, localiser: {ros__parameters: {window: 9}}}', 9)])
+def test_namespaces_may_be_mappings_as_ros_reads_them(
+    tmp_path: Path, text: str, window: int,
+) -> None:
+    path = tmp_path / 'params.yaml'
+    path.write_text(text)
+    assert make_options(path, []).window == window
+
+
+def test_a_parameter_file_of_other_nodes_names_them(tmp_path: Path) -> None:
+    path = tmp_path / 'params.yaml'
+    for text, words in (
+            ('hall: {talker: {ros__parameters: {}}}', 'only parameters of hall.talker'),
+            ('hall: {localiser: {ros_parameters: {}}}', 'only parameters of hall'),
+            ('localiser: {ros_parameters: {}}', 'is localiser.ros_parameters meant?')):
+        path.write_text(text)
+        with pytest.raises(FileError) as refused:
+            make_options(path, [])
+        assert words in str(refused.value)
 
 
 def test_evaluate_prints_and_writes_what_is_true(tmp_path: Path, capsys: Capture) -> None:
@@ -452,7 +480,11 @@ def test_what_is_there_is_not_overwritten_by_a_drive(tmp_path: Path, capsys: Cap
 
 @pytest.mark.parametrize('arguments', [
     ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p.tum', '--plots', 'BAD'],
+    ['replay', str(REPO / 'bags/room'), *ROOM, '--output', 'OUT/p', '--plots', 'OUT/p'],
+    ['replay', str(REPO / 'bags/room'), *ROOM, '--output', ''],
+    ['calibrate', str(REPO / 'bags/room'), *ROOM, '--output', '.'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'BAD/n.md'],
+    ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--output', 'OUT/n.md', '--plots', 'OUT/n.md'],
     ['evaluate', 'OUT/a.tum', 'OUT/a.tum', '--plots', 'BAD'],
     ['faults', '--output', 'BAD'], ['precision', '--output', 'BAD'],
     ['coverage', '--output', 'BAD/c.md'], ['stages', '--output', 'BAD/s.json'],
@@ -537,13 +569,33 @@ def test_an_interrupt_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: Cap
     assert 'interrupted' in err
 
 
-def test_a_closed_pipe_is_no_traceback(tmp_path: Path) -> None:
+@pytest.mark.parametrize('where', ['| true', '>&-'])
+def test_a_closed_output_is_no_traceback(tmp_path: Path, where: str) -> None:
     write_tum(Trajectory([0], np.zeros((1, 3))), tmp_path / 'a.tum')
     line = f'{sys.executable} -m nccs_pose.cli evaluate {tmp_path}/a.tum {tmp_path}/a.tum'
     run = subprocess.run(
-        ['bash', '-c', f'{line} | true'], cwd=REPO, capture_output=True, text=True)
+        ['bash', '-c', f'{line} {where}'], cwd=REPO, capture_output=True, text=True)
     assert 'Traceback' not in run.stderr
     assert 'Exception' not in run.stderr
+    assert run.returncode == 0
+
+
+@pytest.mark.parametrize('arguments', [
+    ['replay', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'MAP'],
+    ['replay', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'LINK'],
+    ['calibrate', str(REPO / 'bags/room'), '--rig', 'RIG', '--map', 'MAP', '--output', 'RIG'],
+    ['starts', '--map', 'MAP', '--output', 'MAP']])
+def test_what_is_read_is_not_replaced(
+    arguments: list[str], tmp_path: Path, capsys: Capture,
+) -> None:
+    files = {kind: tmp_path / f'{kind}.yaml' for kind in ('RIG', 'MAP', 'LINK')}
+    for kind, path in zip(('RIG', 'MAP'), (ROOM[1], ROOM[3])):
+        shutil.copy(path, files[kind])
+    files['LINK'].symlink_to(files['RIG'])
+    before = files['RIG'].read_text(), files['MAP'].read_text()
+    call = [str(files.get(word, word)) for word in arguments]
+    assert 'cannot be written: it is read' in refusal(capsys, call)
+    assert (files['RIG'].read_text(), files['MAP'].read_text()) == before
 
 
 class Terminal(io.StringIO):

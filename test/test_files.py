@@ -163,6 +163,8 @@ def test_a_wrong_rig_is_refused_by_key_and_value(
     ('lines: [1, 2]\n', ['lines[0]', 'mapping', '1']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [-1.6, -1.55]'), ['lines[0]', 'south', 'no length']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25]'), ['lines[0].end', '2 or 3 numbers', '1']),
+    (MAP.replace('end: [1.25, -1.65]', 'end: [455000, 5.4e+6]'),
+     ['lines[0]', 'south', '5.41914e+06 m long', 'more than 10000 m']),
     (MAP.replace('name: east', 'name: south'), ['lines[1].name', 'twice', 'south']),
     (MAP.replace('end: [1.25, -1.65]', 'end: [1.25, 2.0e+7]'), ['lines[0].end', '20000000.0']),
     (f'{MAP}  - {{name: again, start: [1.25, -1.65], end: [-1.6, -1.55]}}\n',

@@ -248,7 +248,8 @@ def test_the_command(
     assert capsys.readouterr().out.split('\n')[:2] == ['arena', 'arena, faint tapes']
     for wrong, said in (
             (['nowhere'], 'no place is called like nowhere'), (['--widths', '642'], '642'),
-            (['--option', 'reach=9.0'], '--map')):
+            (['--option', 'reach=9.0'], '--map'),
+            (['arena', '--map', 'config/soccer_map.yaml'], 'give one of both')):
         assert main(['starts', *wrong]) == 2
         assert said in capsys.readouterr().err
 

@@ -206,7 +206,10 @@ def _usable(measured: Measured) -> int:
 def _nothing(measured: Measured) -> str:
     if measured.seen == 0:
         return 'there is no image to calibrate from'
-    reason, count = measured.reasons.most_common(1)[0] if measured.reasons else ('', 0)
+    if not measured.reasons:
+        return (f'too few images to calibrate from: {measured.seen}, of which {_usable(measured)} '
+                f'show {LEAST_LINES} lines or more')
+    reason, count = measured.reasons.most_common(1)[0]
     return (f'the lines could not be followed in {measured.seen} images (in {count}: {reason}); '
             'the map, the kind of mirror or the colour of the lines is wrong, or the rough rig is '
             'too far off')

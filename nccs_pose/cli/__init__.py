@@ -46,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = parse(argv).run()
         # What is still buffered meets a closed pipe here, not while Python ends.
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as where it was closed
+            sys.stdout.flush()
         return code
     except SystemExit as stop:  # argparse, after it has printed help or usage
         return stop.code if isinstance(stop.code, int) else 2

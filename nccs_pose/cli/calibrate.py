@@ -78,8 +78,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = _options(args)
-    for ending in (args.output.suffix, '.map.yaml', '.report.md', '.residuals_image.png'):
-        check_writable(args.output.with_suffix(ending))
+    inputs = (args.bag, args.rig, args.map)
+    check_writable(args.output, inputs)  # and has a name, beside which there are others
+    for ending in ('.map.yaml', '.report.md', '.residuals_image.png'):
+        check_writable(args.output.with_suffix(ending), inputs)
     images = DriveImages(args.bag, args.images, args.image_topic)
     images.check_size(rig.camera)
     if args.from_rim:

@@ -58,10 +58,10 @@ def run(args: argparse.Namespace) -> int:
     if args.output and args.output.suffix not in ('.json', '.md'):
         raise FileError(f'{args.output}: the numbers are written as .json or .md.')
     lines = tuple(load_map(args.map)) if args.map else ()
-    if args.output:
-        check_writable(args.output)
-    if args.plots:
+    if args.plots:  # first: the folder that this makes may be what a file is to be
         check_writable(args.plots / 'trajectory.png')
+    if args.output:
+        check_writable(args.output, (args.estimated, args.truth, args.map))
     if args.frames is not None and args.frames < len(estimated):
         raise FileError(
             f'--frames {args.frames}: {args.estimated} has more poses, {len(estimated)}.')

@@ -35,7 +35,9 @@ def parse_settings(settings: Iterable[str], fields: Fields) -> dict[str, Any]:
     """
     values: dict[str, Any] = {}
     for setting in settings:
-        name, _, text = setting.partition('=')
+        name, equals, text = setting.partition('=')
+        if not equals:
+            raise OptionError(f'--option {setting}: must be NAME=VALUE.')
         if name not in fields:
             raise OptionError(
                 f'--option {setting}: there is no option {name!r}; there are '

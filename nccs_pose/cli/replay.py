@@ -102,10 +102,12 @@ def run(args: argparse.Namespace) -> int:
     rig, line_map = load_rig(args.rig), load_map(args.map)
     options = make_options(args.params, args.option)
     frames = odometry_frames(args.params)
-    for path in (args.output, *(_beside(args.output, ending) for ending in _ENDINGS)):
-        check_writable(path)
-    if args.plots:
+    if args.plots:  # first: the folder that this makes may be what a file is to be
         check_writable(args.plots / 'trajectory.png')
+    inputs = (args.bag, args.rig, args.map, args.params)
+    check_writable(args.output, inputs)  # and has a name, beside which there are others
+    for ending in _ENDINGS:
+        check_writable(_beside(args.output, ending), inputs)
     topics = BagTopics(
         args.image_topic, args.camera_info_topic, args.odom_topic, args.ground_truth_topic)
     with BagReader(args.bag, topics) as bag:

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         print('\n'.join(place.name for place in places))
         return 0
     if arguments.output is not None:
-        check_writable(arguments.output)
+        check_writable(arguments.output, (arguments.map,))
     rows = []
     work = len(places) * len(arguments.widths) * arguments.trials
     with Progress(work, 'images') as progress:
@@ -74,6 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _chosen(arguments: argparse.Namespace) -> list[Place]:
     if arguments.option and arguments.map is None:
         raise OptionError('--option is for a map of your own: give it by --map')
+    if arguments.map is not None and arguments.names:
+        raise OptionError(
+            f'--map {arguments.map} and the names {", ".join(arguments.names)}: give one of both')
     if arguments.map is not None:
         options = make_options(None, arguments.option)
         return [Place(arguments.map.stem, load_map(arguments.map), options=options)]

@@ -22,7 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from nccs_pose.errors import FileError
+from nccs_pose.files.image_folder import image_files
 from nccs_pose.files.rosbags_import import AnyReader, jazzy_typestore
+
+_STORAGES = ('.mcap', '.db3')
 
 
 def open_bag(path: Path, stack: ExitStack) -> Any:
@@ -33,11 +36,23 @@ def open_bag(path: Path, stack: ExitStack) -> Any:
     with in_words(path):
         if not path.exists():
             raise FileError(f'{path}: no such bag.')
+        if not (path.is_dir() or path.is_file()):  # a pipe is waited for for ever
+            raise FileError(f'{path}: is no bag: it is a pipe or a device.')
         if path.is_dir() and not (path / 'metadata.yaml').exists():
-            raise FileError(
-                f'{path}: is no bag, or its recording was cut off: it has no metadata.yaml '
-                '(`ros2 bag reindex` makes one).')
+            raise FileError(f'{path}: {_without_metadata(path)}.')
         return stack.enter_context(AnyReader([path], default_typestore=jazzy_typestore()))
+
+
+def _without_metadata(folder: Path) -> str:
+    """What a folder is that has no metadata.yaml, and what can be done with it."""
+    if image_files(folder):
+        return ('is a folder of images, no bag: nothing says when they were taken '
+                '(`nccs-pose calibrate` and `nccs-pose check` take such a folder)')
+    files = sorted(p.name for p in folder.iterdir() if p.suffix in _STORAGES)
+    if files:
+        return (f'its recording was cut off: it has no metadata.yaml (`ros2 bag reindex` makes '
+                f'one; {files[0]} can be given by itself if it is whole)')
+    return 'is no bag: it has no metadata.yaml'
 
 
 @contextmanager

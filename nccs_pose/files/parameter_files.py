@@ -15,30 +15,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from nccs_pose.files.yaml_sections import read_yaml
+from nccs_pose.files.yaml_sections import read_yaml, Section
 
 _NODE = 'localiser'
+_PARAMETERS = 'ros__parameters'
+_DEEPEST = 5  # namespaces in one another; a mapping of YAML may hold itself
 
 
 def load_parameters(path: str | Path) -> dict[str, Any]:
     """Read the parameters that a file gives to the node `localiser`, whatever its namespace.
 
     Sections `<namespace>/localiser` and those for every node (`/**`) are taken, later ones over
-    earlier ones.
+    earlier ones; a namespace may also be a mapping around its nodes, as ROS reads it.
 
     :raises FileError: if the file has no such section, or is no parameter file.
     """
     top = read_yaml(path)
     found: dict[str, Any] | None = None
-    for key in top.names():
+    others = []
+    for around, key in _nodes(top, _DEEPEST):
         if key.rsplit('/', 1)[-1] in (_NODE, '*', '**'):
-            section = top.section(key)
-            found = {**(found or {}), **section.section('ros__parameters').content()}
+            section = around.section(key)
+            found = {**(found or {}), **section.section(_PARAMETERS).content()}
             section.done()
+        else:
+            others.append(around.key(key))
     if found is None:
-        others = ', '.join(top.names()) or 'nothing'
-        raise top.error(_NODE, f'is missing: there are only parameters of {others}')
+        raise top.error(
+            _NODE, f'is missing: there are only parameters of {", ".join(others) or "nothing"}')
     return found
+
+
+def _nodes(around: Section, deepest: int) -> Iterator[tuple[Section, str]]:
+    """Each node of a file: the mapping that it stands in, and its key there."""
+    for key, value in around.content().items():
+        if _is_namespace(value, deepest):
+            yield from _nodes(around.section(key), deepest - 1)
+        else:
+            yield around, key
+
+
+def _is_namespace(value: Any, deepest: int) -> bool:
+    """Whether it is no node, but nodes stand in it."""
+    return isinstance(value, dict) and _PARAMETERS not in value and deepest > 0 and any(
+        isinstance(inner, dict) and (_PARAMETERS in inner or _is_namespace(inner, deepest - 1))
+        for inner in value.values())

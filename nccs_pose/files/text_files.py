@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 import errno
 import os
@@ -97,15 +98,19 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         raise FileError(f'{path}: cannot be written: {error.strerror or error}.') from error
 
 
-def check_writable(path: str | Path) -> None:
+def check_writable(path: str | Path, inputs: Iterable[Path | None] = ()) -> None:
     """Refuse a path that :func:`write_text` could not write, before long work and not after it.
 
-    :raises FileError: if it is a folder, or its own folder cannot be made or written.
+    :param inputs: files that the work reads, if they are given: none of them is replaced.
+    :raises FileError: if it is a folder or an input, or its own folder cannot be made or written.
     """
     path = Path(path)
     try:
         if path.is_dir():
             raise FileError(f'{path}: cannot be written: it is a folder.')
+        if path.is_file() and any(
+                each is not None and each.exists() and path.samefile(each) for each in inputs):
+            raise FileError(f'{path}: cannot be written: it is read, and would be lost.')
         target = Path(os.path.realpath(path))
         _make_folder(target)
         if _is_no_file(path):

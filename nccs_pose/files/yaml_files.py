@@ -38,6 +38,7 @@ DISTORTION_MODELS = ('plumb_bob', 'rational_polynomial')
 
 _MOST_PIXELS = 16384  # width or height of an image
 _SAME = 1e-3  # metres between the ends of what is one line given twice
+_LONGEST = 1e4  # metres of a line; what is longer has an end at the origin or in other units
 
 _Value = TypeVar('_Value')
 
@@ -166,6 +167,12 @@ def _line(section: Section, width: float, colour: str, default_name: str) -> Lin
     section.done()
     if np.array_equal(start, end):
         raise section.error('', f'(line {name!r}) has no length: start and end are {start}')
+    length = float(np.linalg.norm(end - start))
+    # The estimator's tables grow with it: millions of metres fill the memory.
+    if length > _LONGEST:
+        raise section.error(
+            '', f'(line {name!r}) is {length:g} m long, more than {_LONGEST:g} m: are both ends '
+            'in metres, and of one origin?')
     return _build(section, '', lambda: Line(start, end, width, colour, name))
 
 

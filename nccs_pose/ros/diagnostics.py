@@ -43,6 +43,7 @@ class Tally:
     :ivar resets: jumps of the stamps into the past, each of which started the tracker anew.
     :ivar refused: messages by cause.
     :ivar errors: exceptions by the function that they came from.
+    :ivar last_trouble: what the last of both said.
     """
 
     received: int = 0
@@ -54,6 +55,7 @@ class Tally:
     errors: Counter[str] = field(default_factory=Counter)
     last_refusal: str = ''
     last_error: str = ''
+    last_trouble: str = ''
 
     @property
     def let_go(self) -> int:
@@ -63,12 +65,12 @@ class Tally:
     def refuse(self, cause: str, words: str) -> None:
         """Count a message that could not be used."""
         self.refused[cause] += 1
-        self.last_refusal = words
+        self.last_refusal = self.last_trouble = words
 
     def fail(self, name: str, error: BaseException) -> None:
         """Count an exception that no code of ours foresaw."""
         self.errors[name] += 1
-        self.last_error = f'{name}: {type(error).__name__}: {error}'
+        self.last_error = self.last_trouble = f'{name}: {type(error).__name__}: {error}'
 
 
 def status(name: str, level: bytes, message: str, values: dict[str, object]) -> DiagnosticStatus:
@@ -153,13 +155,15 @@ def image_status(
     :param fresh_refusals: messages refused, or callbacks failed, since the last report.
     :param fresh_lost: images lost by the middleware since the last report.
     """
-    words, level = f'images come on {topic}', DiagnosticStatus.OK
+    words, level = (
+        f'images come on {topic}' if tally.received else f'no image yet on {topic}'
+    ), DiagnosticStatus.OK
     if fresh_lost:
         words, level = (
             f'{fresh_lost} images were lost by the middleware: does the camera use '
             'fastdds_large_images.xml?'), DiagnosticStatus.WARN
     if fresh_refusals:
-        words, level = tally.last_refusal or tally.last_error, DiagnosticStatus.WARN
+        words, level = tally.last_trouble, DiagnosticStatus.WARN
     if problem:
         words, level = problem, DiagnosticStatus.WARN
     values: dict[str, object] = {

@@ -68,6 +68,7 @@ class ImageStream:
         endpoint, kind = (
             (IMAGE, Image) if transport == 'raw' else (IMAGE_COMPRESSED, CompressedImage))
         self._node = node
+        self._type = endpoint.type
         self._tally = tally
         self._on_frame = on_frame
         self._sequence: int | None = None
@@ -103,13 +104,23 @@ class ImageStream:
         elif self._incompatible:
             words = self._incompatible
         elif not self.publishers:
-            words = f'nothing publishes {self.topic}'
+            words = self._mistyped() or f'nothing publishes {self.topic}'
         else:
             words = f'{self.topic} has a publisher, but no image came for a while'
         if words and words != self._last_words:
             self._node.get_logger().warning(words)
         self._last_words = words
         return words
+
+    def _mistyped(self) -> str:
+        """What is published under the topic's name and is none of it; empty if nothing is."""
+        others = {info.topic_type for info in self._node.get_publishers_info_by_topic(self.topic)}
+        others.discard(self._type)
+        if not others:
+            return ''
+        return (f'{self.topic} is published as {", ".join(sorted(others))}, but is subscribed as '
+                f'{self._type}: remap the other of image and image/compressed, or set '
+                'image_transport')
 
     def _receive(self, message: Image | CompressedImage, info: dict[str, Any]) -> None:
         taken = [(message, info), *waiting(self._subscription, self._waiting)]

@@ -66,12 +66,14 @@ class Inputs:
         self._keeper = keeper
         self._refuse = refuse
         self._on_camera_problem = on_camera_problem
-        self._odometry = self._listen(ODOM, Odometry, self._on_odometry)
-        self._subscriptions = [
-            self._odometry,
-            self._listen(CAMERA_INFO, CameraInfo, self._on_camera_info),
-            self._listen(INITIAL_POSE, PoseWithCovarianceStamped, self._on_initial_pose),
-        ]
+        self._subscriptions: list[Subscription] = []
+        try:
+            self._odometry = self._listen(ODOM, Odometry, self._on_odometry)
+            self._listen(CAMERA_INFO, CameraInfo, self._on_camera_info)
+            self._listen(INITIAL_POSE, PoseWithCovarianceStamped, self._on_initial_pose)
+        except BaseException:
+            self.close()  # nobody else knows of what has been made
+            raise
 
     def close(self) -> None:
         """Unsubscribe."""
@@ -97,9 +99,11 @@ class Inputs:
             except FrameRefusedError as error:
                 self._refuse(error.cause, str(error))
 
-        return self._node.create_subscription(
+        subscription = self._node.create_subscription(
             kind, endpoint.name, receive, profile(endpoint), raw=True,
             qos_overriding_options=overridable())
+        self._subscriptions.append(subscription)
+        return subscription
 
     def _on_odometry(self, message: Odometry) -> None:
         options = self._options()

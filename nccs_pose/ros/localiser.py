@@ -14,23 +14,22 @@
 
 """Entry point of `ros2 run nccs_pose localiser`.
 
-Light on purpose: SIGINT and SIGTERM end the program with exit code 0 from here on, also during
-the second that the imports of the node take.
+Light on purpose: SIGINT, SIGTERM and SIGHUP end the program with exit code 0 from here on, also
+during the second that the imports of the node take.
 """
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from typing import Any, NoReturn
+
+from nccs_pose.ros.end_signals import handle_end_signals
 
 
 def main() -> int:
     """Run the node until it is told to stop."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _leave)
+    handle_end_signals(_leave)
     from nccs_pose.estimation.options import LocaliserOptions
     from nccs_pose.node_options import NodeOptions
     from nccs_pose.ros.command_line import read_command_line

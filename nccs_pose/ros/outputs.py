@@ -26,13 +26,14 @@ from nccs_pose.geometry.rig import Rig
 from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros.conversions import image_message, pose_message
 from nccs_pose.ros.debug_image import draw_debug_image
-from nccs_pose.ros.interface import DEBUG_IMAGE, MARKERS, POSE
+from nccs_pose.ros.interface import DEBUG_IMAGE, Endpoint, MARKERS, POSE
 from nccs_pose.ros.markers import marker_array
 from nccs_pose.ros.qos import overridable, profile
 from nccs_pose.ros.transforms import TransformOutput
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import Image
 from visualization_msgs.msg import MarkerArray
 
@@ -57,11 +58,20 @@ class Outputs:
         self._rig = rig
         self._map = line_map
         self.transforms = TransformOutput(node, options, refuse)
-        self._pose, self._debug, self._markers = (
-            node.create_publisher(
-                kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
-            for kind, endpoint in (
-                (PoseWithCovarianceStamped, POSE), (Image, DEBUG_IMAGE), (MarkerArray, MARKERS)))
+        self._publishers: list[Publisher] = []
+        try:
+            self._pose = self._advertise(PoseWithCovarianceStamped, POSE)
+            self._debug = self._advertise(Image, DEBUG_IMAGE)
+            self._markers = self._advertise(MarkerArray, MARKERS)
+        except BaseException:
+            self.close()  # nobody else knows of what has been made
+            raise
+
+    def _advertise(self, kind: type, endpoint: Endpoint) -> Publisher:
+        publisher = self._node.create_publisher(
+            kind, endpoint.name, profile(endpoint), qos_overriding_options=overridable())
+        self._publishers.append(publisher)
+        return publisher
 
     def publish(self, estimate: Estimate) -> bool:
         """Publish the pose and the transform of an estimate.
@@ -102,5 +112,5 @@ class Outputs:
     def close(self) -> None:
         """Destroy the publishers."""
         self.transforms.close()
-        for publisher in (self._pose, self._debug, self._markers):
+        for publisher in self._publishers:
             self._node.destroy_publisher(publisher)

@@ -140,7 +140,9 @@ class NodeParameters:
             changes = {p.name: p.value for p in parameters if p.name in self._fields}
             for name, value in changes.items():
                 check_value(self._fields[name], value)
-            self._build(changes)
+            # Others, as rclpy's own for a topic, are not to be refused for what is wrong here.
+            if changes:
+                self._build(changes)
         except OptionError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

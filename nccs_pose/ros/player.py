@@ -215,7 +215,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f'play: nobody subscribes {", ".join(options.wait_for)}; playing anyway',
                       file=sys.stderr)
             player.play()
-            print('played ' + ', '.join(f'{n} x {t}' for t, n in sorted(player.sent.items())))
+            # Logged, not printed: nobody may be left to read it.
+            node.get_logger().info(
+                'played ' + ', '.join(f'{n} x {t}' for t, n in sorted(player.sent.items())))
     except NccsPoseError as error:
         print(f'play: {error}', file=sys.stderr)
         return 2

@@ -16,7 +16,7 @@
 
 rclpy lets an exception of any callback out of `spin`, which ends the node, and a message that
 cannot be taken leaves its callback group locked for ever. Here both are reported and the loop
-goes on; SIGINT and SIGTERM end it in order, with exit code 0.
+goes on; SIGINT, SIGTERM and SIGHUP end it in order, with exit code 0.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     The node may have `report(name, exception)`, called for what its callbacks raise, and
     `close()`, called before it is destroyed.
 
-    :returns: exit code: 0 after SIGINT or SIGTERM, 2 if the ROS arguments cannot be read or used.
+    :returns: exit code: 0 after a signal that ends it, 2 if the ROS arguments cannot be read or
+        used.
     """
     node: Node | None = None
     executor: GuardedExecutor | None = None

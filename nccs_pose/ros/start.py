@@ -14,21 +14,21 @@
 
 """Initialising ROS, with words instead of a traceback where it cannot be; and leaving it.
 
-SIGINT and SIGTERM are noted, and a program ends where it looks whether it was told to. rclpy's own
-handlers are not installed: they shut ROS down from another thread, while the main thread may be in
-the middle of making, using or destroying what is taken away.
+SIGINT, SIGTERM and SIGHUP are noted, and a program ends where it looks whether it was told to.
+rclpy's own handlers are not installed: they shut ROS down from another thread, while the main
+thread may be in the middle of making, using or destroying what is taken away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import signal
 import tempfile
-from typing import Any
 
 from nccs_pose.errors import NccsPoseError
+from nccs_pose.ros.end_signals import handle_end_signals
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
@@ -41,7 +41,7 @@ class StartError(NccsPoseError):
 
 
 def initialise(args: Sequence[str] | None = None) -> None:
-    """Initialise rclpy; from here on SIGINT and SIGTERM are noted, see `told_to_end`.
+    """Initialise rclpy; from here on the signals that end it are noted, see `told_to_end`.
 
     Where nothing says where to log to, as for a service manager's programs without HOME, it is
     logged to the temporary folder.
@@ -49,7 +49,7 @@ def initialise(args: Sequence[str] | None = None) -> None:
     :param args: command line, None for the program's own.
     :raises StartError: e.g. for a parameter file that is not there.
     """
-    _set_signals(_note)
+    handle_end_signals(_note)
     if not any(os.environ.get(name) for name in LOG_VARIABLES):
         os.environ['ROS_LOG_DIR'] = str(Path(tempfile.gettempdir(), f'ros_log_{os.getuid()}'))
     try:
@@ -60,7 +60,7 @@ def initialise(args: Sequence[str] | None = None) -> None:
 
 
 def told_to_end() -> bool:
-    """Whether SIGINT or SIGTERM came since ROS was initialised.
+    """Whether a signal that ends it came since ROS was initialised.
 
     However often: in a launch file one Ctrl-C comes from the terminal and one from launch.
     """
@@ -69,7 +69,7 @@ def told_to_end() -> bool:
 
 def leave() -> None:
     """Shut rclpy down; no signal disturbs the end of Python, which brings back the defaults."""
-    _set_signals(signal.SIG_IGN)
+    handle_end_signals(signal.SIG_IGN)
     rclpy.try_shutdown()
 
 
@@ -78,10 +78,3 @@ _noted: list[int] = []
 
 def _note(number: int, frame: object) -> None:
     _noted.append(number)
-
-
-def _set_signals(handler: Callable[[int, Any], None] | signal.Handlers) -> None:
-    """Handle what the program was not started to ignore, as a shell's background job is."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, handler)

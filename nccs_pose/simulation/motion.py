@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 _WAYPOINTS = 6  # of a random loop
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)  # found once: each pose of a loop needs them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,11 +95,10 @@ class Loop:
 
     def _measure(self, knots: np.ndarray) -> np.ndarray:
         """Length of the track up to each knot, by Gauss-Legendre over each piece."""
-        nodes, weights = np.polynomial.legendre.leggauss(5)
         half = 0.5 * np.diff(knots)
-        at = knots[:-1, None] + half[:, None] * (1.0 + nodes)
+        at = knots[:-1, None] + half[:, None] * (1.0 + _NODES)
         speed = np.linalg.norm(self._velocity(at), axis=-1)
-        return np.r_[0.0, np.cumsum(half * (speed @ weights))]
+        return np.r_[0.0, np.cumsum(half * (speed @ _WEIGHTS))]
 
     def _parameter(self, t: float) -> float:
         """Spline parameter after t s: looked up, then one Newton step on the length."""

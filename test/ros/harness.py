@@ -100,6 +100,7 @@ class User:
     """Somebody at the other end: subscribes, publishes, calls services."""
 
     def __init__(self, domain: int) -> None:
+        self.domain = domain
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = Node('user', context=self._context, use_global_arguments=False)

@@ -16,13 +16,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
+import sys
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not available: no rclpy')
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from harness import REPOSITORY
 from nccs_pose.evaluation.metrics import compare, summarise
 from nccs_pose.evaluation.trajectory import Trajectory
 from nccs_pose.files.bags import BagReader
@@ -114,6 +118,16 @@ def test_player_loops_until_it_is_stopped(world):
     # Terminal and launch file send one each; and somebody may be impatient.
     assert player.stop(signal.SIGINT, times=8) == 0, player.output
     assert 'Traceback' not in player.output
+
+
+@pytest.mark.parametrize('where', ['| true', '> /dev/full', '2>&1 >&- | cat'])
+def test_player_needs_nobody_to_read_what_it_says(world, where):
+    play = f'{sys.executable} -m nccs_pose.ros.player {BAG} --rate 100 --topics /odom'
+    run = subprocess.run(
+        ['bash', '-o', 'pipefail', '-c', f'{play} {where}'], capture_output=True, text=True,
+        cwd=REPOSITORY, env={**os.environ, 'ROS_DOMAIN_ID': str(world.user.domain)})
+    assert run.returncode == 0, run.stderr
+    assert 'Traceback' not in run.stdout + run.stderr
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [

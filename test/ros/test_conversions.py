@@ -37,7 +37,7 @@ from nccs_pose.geometry.pose import Pose2
 from nccs_pose.node_options import NodeOptions
 from nccs_pose.ros import conversions as c
 from nccs_pose.ros.camera_check import contradiction
-from nccs_pose.ros.diagnostics import pose_status
+from nccs_pose.ros.diagnostics import image_status, pose_status, Tally
 from nccs_pose.simulation.scene import arena_rig
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
@@ -289,6 +289,16 @@ def test_every_field_has_the_right_python_type(checks: str):
         [sys.executable, '-c', BUILD_EVERY_MESSAGE], capture_output=True, text=True, check=False,
         env={**os.environ, 'ROS_PYTHON_CHECK_FIELDS': checks})
     assert done.stdout.strip() == 'all built', done.stderr
+
+
+def test_the_last_trouble_is_what_is_said() -> None:
+    tally = Tally()
+    for trouble, words in (
+            (lambda: tally.refuse('image_size', 'too small'), 'too small'),
+            (lambda: tally.fail('here', ValueError('no way')), 'here: ValueError: no way'),
+            (lambda: tally.refuse('image_size', 'too large'), 'too large')):
+        trouble()
+        assert image_status('n', '/image', 1, tally, '', 1, 0).message == words
 
 
 def test_a_pose_of_images_that_no_longer_come_is_no_good_news() -> None:

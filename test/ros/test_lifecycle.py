@@ -34,7 +34,7 @@ from nccs_pose.ros.conversions import image_message
 import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
 ARENA = {'rig_file': 'config/arena_640_rig.yaml', 'map_file': 'config/arena_map.yaml'}
@@ -186,7 +186,7 @@ def test_transforms_without_tf2_ros_fail_with_the_reason(world):
     assert node.running()
 
 
-@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_the_node_that_works_on_images(world, arena, how):
     node, user = world.localiser(**ARENA), world.user
     images = user.publisher(Image, 'image')
@@ -198,7 +198,7 @@ def test_signals_end_the_node_that_works_on_images(world, arena, how):
     assert 'Traceback' not in node.output
 
 
-@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_the_node_while_it_starts(world, how):
     caught = [world.localiser(**ROOM) for _ in range(3)]
     # From the program's first line on; among the imports; somewhere before it is active.
@@ -210,7 +210,7 @@ def test_signals_end_the_node_while_it_starts(world, how):
         assert 'Traceback' not in node.output
 
 
-@pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('how', ['SIGINT', 'SIGTERM', 'SIGHUP'])
 def test_a_signal_is_noted_and_ros_stays_up_until_it_is_left(how):
     program = f"""
 import os, signal, time
@@ -248,8 +248,17 @@ def test_silence_is_said_with_the_topic_and_the_reason(world):
     def said(words: str) -> bool:
         return words in getattr(user.statuses.get('localiser: images'), 'message', '')
 
+    # That images come is not said before one has.
+    assert user.wait(lambda: 'localiser: images' in user.statuses), node.output
+    assert said('no image yet on /front/image') or said('nothing publishes /front/image')
     assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     assert 'nothing publishes /front/image' in node.output
+    compressed = user.node.create_publisher(CompressedImage, '/front/image', 1)
+    assert user.wait(lambda: said(
+        '/front/image is published as sensor_msgs/msg/CompressedImage, but is subscribed as '
+        'sensor_msgs/msg/Image')), node.output
+    user.node.destroy_publisher(compressed)
+    assert user.wait(lambda: said('nothing publishes /front/image')), node.output
     user.node.create_publisher(
         Image, '/front/image', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     assert user.wait(lambda: said(f'set {reliability}')), node.output

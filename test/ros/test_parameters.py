@@ -29,6 +29,7 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from rclpy.lifecycle import TransitionCallbackReturn
 
 ROOM = {'rig_file': 'config/room_rig.yaml', 'map_file': 'config/room_map.yaml'}
 
@@ -122,6 +123,34 @@ def test_an_impossible_depth_is_named(world, topic, end, state):
     assert user.wait(lambda: user.value('localiser: pose', 'lifecycle') == state), node.output
     assert topic in node.output
     assert 'depth = -1: must lie in' in user.value('localiser: pose', 'reason')
+
+
+@pytest.mark.parametrize('pair', [
+    {'autostart': False, f'qos_overrides./{topic}.{end}.depth': -1} for topic, end in (
+        ('localiser/markers', 'publisher'), ('initialpose', 'subscription'))], indirect=True)
+def test_a_transition_that_fails_leaves_no_topic_behind(pair):
+    def topics() -> list[str]:
+        used = [*pair.node.publishers, *pair.node.subscriptions]
+        return sorted(each.topic_name for each in used)
+
+    before = topics()
+    for _ in range(2):
+        inactive = pair.node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        if inactive:
+            pair.node.trigger_activate()
+        assert 'depth = -1' in pair.node._problem()
+        if inactive:
+            pair.node.trigger_cleanup()
+        assert topics() == before
+
+
+@pytest.mark.parametrize('pair', [
+    {'map_frame': '', 'qos_overrides./diagnostics.publisher.depth': 7}], indirect=True)
+def test_a_parameter_that_does_not_fit_is_the_only_one_refused(pair):
+    assert pair.node._problem() == (
+        "configuration failed: map_frame = '': a frame is not empty and has no leading /")
+    assert pair.node._diagnostics.qos_profile.depth == 7
+    pair.set(use_sim_time=True)
 
 
 @pytest.mark.parametrize('override', ['depth:=0', 'depth:=deep', 'reliability:=perhaps'])
