@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
+from nccs_pose.geometry.pose import Array, checked_vector, Pose2, RigidTransform
 import numpy as np
 
 
@@ -46,10 +46,7 @@ class Line:
 
     def __post_init__(self) -> None:
         for key in ('start', 'end'):
-            point = np.array(getattr(self, key), dtype=float)
-            if point.shape != (3,) or not np.isfinite(point).all():
-                raise GeometryError(
-                    f'line {self.name!r}: {key} {point.tolist()} is not three finite numbers')
+            point = checked_vector(f'line {self.name!r}: {key}', getattr(self, key))
             # What follows from the ends is kept.
             point.setflags(write=False)
             object.__setattr__(self, key, point)

@@ -21,9 +21,9 @@ from functools import cached_property
 import math
 
 from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, checked_vector
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 _CONE_TOLERANCE = 1e-12
 
@@ -131,6 +131,20 @@ class QuadricMirror:
         """Whether a point (3,) lies inside the mirror's body."""
         below = self.A >= 0.0 or self.A * float(point[2]) + 0.5 * self.B > 0.0
         return bool(self.level(point) <= 0.0) and below
+
+    def checked_cop(self, cop: ArrayLike) -> Array:
+        """Return a centre of projection (3,) that a camera before this mirror can have, a copy.
+
+        :raises GeometryError: if it is not three finite numbers, off the plane x = 0, or inside
+            the mirror.
+        """
+        cop = checked_vector('cop', cop)
+        if cop[0] != 0.0:
+            raise GeometryError(
+                f'cop {cop.tolist()}: its x must be 0 (turn the mirror frame about its axis)')
+        if self.encloses(cop):
+            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
+        return cop
 
     def intersect(self, origin: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Where rays from one origin first meet the mirror from outside.

@@ -54,12 +54,8 @@ def reflect_points(
     :raises GeometryError: if the centre of projection or a point is not finite or of the wrong
         shape, or if the centre of projection is off the plane x = 0 or inside the mirror.
     """
-    cop = np.asarray(cop, dtype=np.float64)
+    cop = mirror.checked_cop(cop)
     points = np.asarray(points, dtype=np.float64)
-    if cop.shape != (3,) or not np.isfinite(cop).all():
-        raise GeometryError(f'cop must be 3 finite numbers, got {cop.tolist()}')
-    if cop[0] != 0.0:
-        raise GeometryError(f'cop must lie in the plane x = 0 of the mirror frame, x = {cop[0]}')
     if points.ndim != 2 or points.shape[1] != 3:
         raise GeometryError(f'points must have the shape (N, 3), got {points.shape}')
     if not np.isfinite(points).all():
@@ -83,8 +79,6 @@ class _Scene:
 
     def __init__(self, mirror: QuadricMirror, cop: Array) -> None:
         self.apex = np.array([0.0, 0.0, mirror.apex_z])
-        if mirror.encloses(cop):
-            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
         self.mirror = mirror
         self.unit = float(np.linalg.norm(cop - self.apex))
         self.a = float(mirror.A)

@@ -39,7 +39,7 @@ from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.paper_polynomials import mirror_polynomials, MirrorPolynomials
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, checked_vector
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,19 +84,13 @@ class ReflectionCurve:
     direction: Array
 
     def __post_init__(self) -> None:
-        for key in ('cop', 'point', 'direction'):
-            value = np.array(getattr(self, key), dtype=float)
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise GeometryError(f'{key} {value.tolist()} is not three finite numbers')
-            object.__setattr__(self, key, value)
-        length = np.linalg.norm(self.direction)
+        object.__setattr__(self, 'cop', self.mirror.checked_cop(self.cop))
+        object.__setattr__(self, 'point', checked_vector('point', self.point))
+        direction = checked_vector('direction', self.direction)
+        length = np.linalg.norm(direction)
         if length == 0.0:
             raise GeometryError('the line has the direction d = 0')
-        if self.cop[0] != 0.0:
-            raise GeometryError(f'cop {self.cop.tolist()}: its x must be 0')
-        if self.mirror.encloses(self.cop):
-            raise GeometryError(f'cop {self.cop.tolist()} lies inside the mirror')
-        object.__setattr__(self, 'direction', self.direction / length)
+        object.__setattr__(self, 'direction', direction / length)
 
     @classmethod
     def of_line(cls, rig: Rig, line: Line) -> ReflectionCurve:
