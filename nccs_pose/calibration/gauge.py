@@ -105,7 +105,7 @@ def gauges(parameters: RigParameters, model: RigModel) -> list[tuple[str, Array]
                       "mirror's axis)", _moves(parameters, [
                           {'cop_x': -rig.cop[1], 'camera_z': 1.0}])))
     if rig.mirror.kind == 'sphere' and {'tilt_x', 'tilt_y'} <= parameters.index.keys():
-        arm = rig.cop + np.array([0.0, 0.0, 0.5 * rig.mirror.B])
+        arm = rig.cop - np.array([0.0, 0.0, rig.mirror.centre_z])
         moves = []
         for axis in np.eye(3)[:2]:
             shift = np.cross(axis, arm)

@@ -139,11 +139,7 @@ class ReflectionCurve:
 
     def rays(self, points: Array) -> Array:
         """Unit reflected rays (N, 3) at mirror points (N, 3)."""
-        n = self.mirror.normal(points)
-        v = points - self.cop
-        along = np.einsum('ni,ni->n', v, n) / np.einsum('ni,ni->n', n, n)
-        v = v - 2.0 * along[:, None] * n
-        return v / np.linalg.norm(v, axis=1, keepdims=True)
+        return self.mirror.reflected(points - self.cop, points)
 
     def along_line(self, points: Array) -> tuple[Array, Array]:
         """Where reflected rays pass the line, for mirror points (N, 3).
