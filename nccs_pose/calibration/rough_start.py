@@ -48,7 +48,6 @@ class Start:
     :ivar adjustment: over the frames that are used.
     :ivar used: indices of those frames.
     :ivar agreement: fraction of all frames that the rig explains.
-    :ivar settled: whether rig and poses agree well enough to be believed.
     """
 
     adjustment: Adjustment
