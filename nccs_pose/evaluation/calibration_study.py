@@ -33,13 +33,12 @@ from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.procedure import calibrate
 from nccs_pose.errors import CalibrationError, GeometryError
-from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, rotation_exp
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.scene import arena_map, arena_rig
-from nccs_pose.simulation.table_one import look_at, TABLE_ONE
+from nccs_pose.simulation.table_one import CAMERA, look_at, TABLE_ONE
 import numpy as np
 from scipy.stats import chi2
 
@@ -136,13 +135,12 @@ def random_rig(kind: str, rng: Random) -> Rig:
         like.mirror.A, scale * like.mirror.B, scale**2 * like.mirror.C)
     cop = scale * like.cop + np.array([0.0, *rng.uniform(-3e-3, 3e-3, 2)])
     aim = rotation_exp(np.deg2rad(rng.uniform(-2.0, 2.0, 3)))
-    camera = PinholeCamera(1200, 800, 750.0, 750.0, 599.5, 399.5)
     mounting = RigidTransform.from_rpy(
         [np.pi + np.deg2rad(rng.uniform(-1, 1)), np.deg2rad(rng.uniform(-1, 1)),
          rng.uniform(-np.pi, np.pi)],
         [rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1), rng.uniform(0.6, 0.9)])
     rotation = look_at(cop, np.array([0.0, 0.0, mirror.apex_z])) @ aim
-    return Rig(mirror, camera, cop, rotation, mounting)
+    return Rig(mirror, CAMERA, cop, rotation, mounting)
 
 
 @dataclass(frozen=True)
