@@ -41,9 +41,8 @@ def predict_frame(
     for index, (line, along) in enumerate(
             zip(line_map, np.broadcast_to(where, (len(line_map), points)))):
         sides = np.where(np.arange(points) % 2, 1, -1) if line.width > 0.0 else np.zeros(points)
-        left = np.cross([0.0, 0.0, 1.0], line.direction)
         world.append(line.start + along[:, None] * (line.end - line.start)
-                     + (0.5 * line.width * sides)[:, None] * left)
+                     + (0.5 * line.width * sides)[:, None] * line.left)
         label.append(np.full(points, index))
         side.append(sides)
     pixels, seen = rig.project(pose.inverse().apply(np.concatenate(world)))

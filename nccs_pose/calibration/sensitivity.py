@@ -161,10 +161,9 @@ class EdgeLines:
     def __init__(
         self, line_map: LineMap, index: NDArray[np.intp], side: NDArray[np.int8],
     ) -> None:
-        left = np.cross([0.0, 0.0, 1.0], line_map.directions)
         # A line that stands upright has no left; nothing of it can be shifted that way.
         self.direction = line_map.directions[index]
-        self.left = left[index]
+        self.left = line_map.lefts[index]
         self.half_side = 0.5 * side
         shift = self.half_side * line_map.widths[index]
         self.middle = (0.5 * (line_map.starts + line_map.ends))[index] + shift[:, None] * self.left

@@ -70,6 +70,11 @@ class Line:
         return (self.end - self.start) / self.length
 
     @cached_property
+    def left(self) -> Array:
+        """Horizontal vector (3,) to the left of the direction; unit if the line is horizontal."""
+        return np.array([-self.direction[1], self.direction[0], 0.0])
+
+    @cached_property
     def moment(self) -> Array:
         """Plücker moment mu = q x d (3,), metres."""
         return np.cross(self.start, self.direction)
@@ -86,8 +91,8 @@ class Line:
 
     def edges(self) -> tuple[Line, Line]:
         """The right and the left edge of the tape, each a line of no width."""
-        left = np.array([-self.direction[1], self.direction[0], 0.0])
-        return (self._shifted(-0.5 * self.width * left), self._shifted(0.5 * self.width * left))
+        half = 0.5 * self.width * self.left
+        return self._shifted(-half), self._shifted(half)
 
     def _shifted(self, offset: Array) -> Line:
         return replace(self, start=self.start + offset, end=self.end + offset, width=0.0)
@@ -139,6 +144,11 @@ class LineMap:
     def directions(self) -> Array:
         """Unit directions (L, 3)."""
         return np.array([line.direction for line in self.lines])
+
+    @cached_property
+    def lefts(self) -> Array:
+        """Vectors to the left of the directions (L, 3)."""
+        return np.array([line.left for line in self.lines])
 
     @cached_property
     def moments(self) -> Array:
