@@ -88,9 +88,7 @@ class ArrowSystem:
         :returns: information on the rig (P, P), its slope (P,), and -dpose/drig (F, 3, P), how
             the poses give way to the rig.
         """
-        diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
-        gain = np.linalg.solve(poses, self.coupling)
+        gain = np.linalg.solve(self._damped_poses(damping), self.coupling)
         rig = self.rig
         rig = rig + damping * np.diag(np.diag(rig))
         return (rig - np.einsum('fip,fiq->pq', self.coupling, gain),
@@ -98,20 +96,22 @@ class ArrowSystem:
 
     def pulls(self) -> tuple[Array, Array]:
         """Slope (F, P) and curvature (F, P, P) of each frame alone, its pose eliminated."""
-        gain = np.linalg.solve(self.poses + VAGUE_INFORMATION, self.coupling)
+        gain = np.linalg.solve(self._damped_poses(0.0), self.coupling)
         return (self.rig_slopes - np.einsum('fip,fi->fp', gain, self.pose_slopes),
                 self.rigs - np.einsum('fip,fiq->fpq', self.coupling, gain))
 
     def solve(self, theta: Array, spread: Array, damping: float) -> tuple[Array, Array]:
         """Step of the rig (P,) and of the poses (F, 3)."""
         information, slope, gain = self.reduced(damping)
-        # In units of the spread the matrix is well scaled, whatever the parameters' units.
-        scaled = information * np.outer(spread, spread) + np.eye(len(spread))
-        step = -spread * np.linalg.solve(scaled, spread * slope + theta / spread)
-        diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
-        alone = np.linalg.solve(poses, self.pose_slopes[:, :, None])[:, :, 0]
+        step = rig_step(information, slope, theta, spread)
+        alone = np.linalg.solve(
+            self._damped_poses(damping), self.pose_slopes[:, :, None])[:, :, 0]
         return step, -alone - gain @ step
+
+    def _damped_poses(self, damping: float) -> Array:
+        """The poses' blocks (F, 3, 3) that are solved with, regular whatever a frame shows."""
+        diagonal = np.einsum('fii->fi', self.poses)
+        return self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +195,17 @@ def adjust(
         parameters.model(theta, with_rim=True), theta, poses, information,
         posterior(information, parameters.spread), gain, terms.residual, inlier, scale, reduced,
         shared, ended and finished, used)
+
+
+def rig_step(information: Array, slope: Array, theta: Array, spread: Array) -> Array:
+    """The step (P,) from theta to the least of data and rough values together.
+
+    :param information: of the data, the poses eliminated (P, P).
+    :param slope: of half their squares there (P,).
+    """
+    # In units of the spread the matrix is well scaled, whatever the parameters' units.
+    scaled = information * np.outer(spread, spread) + np.eye(len(spread))
+    return np.asarray(-spread * np.linalg.solve(scaled, spread * slope + theta / spread))
 
 
 def posterior(information: Array, spread: Array) -> Array:
