@@ -165,10 +165,10 @@ def adjust(
     problem = Problem(parameters, observations)
     theta = np.zeros(len(parameters)) if theta is None else np.array(theta, dtype=float)
     everything = np.ones(len(observations), dtype=bool)
-    theta, poses, terms, ended, used = _descend(
-        problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
-    scale = _robust_scale(terms)
-    inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
+    found = _descend(problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
+    converged, steps = found.converged, found.steps
+    scale = _robust_scale(found.terms)
+    inlier = found.terms.hit & (np.abs(found.terms.residual) <= _GATE * scale)
     if inlier.sum() < 3 * observations.frames + len(parameters):
         raise CalibrationError(
             f'only {int(inlier.sum())} of {len(observations)} points lie on the lines that they '
@@ -176,25 +176,30 @@ def adjust(
     for _ in range(_FEET):
         # Curves that are far from the pixels say nothing of where on them the feet would be.
         if scale <= _SOUND:
-            problem.drop_feet(theta, poses)
-        theta, poses, terms, finished, more = _descend(
-            problem, theta, poses, inlier, cauchy=False)
-        used += more
-    e = terms.residual[inlier]
+            problem.drop_feet(found.theta, found.poses)
+        found = _descend(problem, found.theta, found.poses, inlier, cauchy=False)
+        steps += found.steps
+    e = found.terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
     reduced = float(e @ e) / degrees
-    system = ArrowSystem.of(terms, inlier.astype(float), problem.slices)
+    system = ArrowSystem.of(found.terms, inlier.astype(float), problem.slices)
+    shared = _shared_scatter(system, parameters.spread)
     information, _, gain = system.reduced()
     # Residuals larger than the noise was told to be widen the claim, and so do errors that the
     # points of a frame share; smaller ones do not narrow it.
-    found = pull_statistics(*system.pulls(), parameters.spread)
-    by_chance = chi2.isf(_CHANCE, max(found.degrees, 1.0)) / max(found.degrees, 1.0)
-    shared = found.scatter if found.scatter > by_chance else 1.0
     information = 0.5 * (information + information.T) / max(1.0, reduced, shared)
     return Adjustment(
-        parameters.model(theta, with_rim=True), theta, poses, information,
-        posterior(information, parameters.spread), gain, terms.residual, inlier, scale, reduced,
-        shared, ended and finished, used)
+        parameters.model(found.theta, with_rim=True), found.theta, found.poses, information,
+        posterior(information, parameters.spread), gain, found.terms.residual, inlier, scale,
+        reduced, shared, converged and found.converged, steps)
+
+
+def _shared_scatter(system: ArrowSystem, spread: Array) -> float:
+    """Scatter of the frames' pulls over that of independent noise; 1 if it is chance."""
+    found = pull_statistics(*system.pulls(), spread)
+    degrees = max(found.degrees, 1.0)
+    by_chance = float(chi2.isf(_CHANCE, degrees)) / degrees
+    return found.scatter if found.scatter > by_chance else 1.0
 
 
 def rig_step(information: Array, slope: Array, theta: Array, spread: Array) -> Array:
@@ -220,10 +225,28 @@ def _robust_scale(terms: Linearisation) -> float:
     return robust_scale(residual) if len(residual) else _MISSED
 
 
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """Where the method ended.
+
+    :ivar theta: deviation from the rough rig (P,).
+    :ivar poses: T_map_base of every frame (F, 3).
+    :ivar terms: residuals and derivatives there.
+    :ivar converged: whether the last step was negligible.
+    :ivar steps: how many were taken.
+    """
+
+    theta: Array
+    poses: Array
+    terms: Linearisation
+    converged: bool
+    steps: int
+
+
 def _descend(
     problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], *, cauchy: bool,
-) -> tuple[Array, Array, Linearisation, bool, int]:
-    """Levenberg-Marquardt; returns where it ends, whether it converged, and the steps taken."""
+) -> _Descent:
+    """Levenberg-Marquardt over the chosen points (N,), under Cauchy's loss or least squares."""
     spread, damping = problem.parameters.spread, 0.0
     terms = problem.linearise(theta, poses)
     for iteration in range(_MOST_STEPS):
@@ -245,10 +268,10 @@ def _descend(
             damping = max(1e-3, 10.0 * damping)
         # A step of a thousandth of what the data can tell ends the search.
         if size < 1e-6:
-            return theta, poses, terms, True, iteration + 1
+            return _Descent(theta, poses, terms, True, iteration + 1)
         if damping > 1e8:
-            return theta, poses, terms, False, iteration + 1
-    return theta, poses, terms, False, _MOST_STEPS
+            break
+    return _Descent(theta, poses, terms, False, iteration + 1)
 
 
 def _squared_size(system: ArrowSystem, step: Array, pose_step: Array, spread: Array) -> float:
