@@ -92,7 +92,8 @@ class ArrowSystem:
         rig = self.rig
         rig = rig + damping * np.diag(np.diag(rig))
         return (rig - np.einsum('fip,fiq->pq', self.coupling, gain),
-                self.rig_slopes.sum(axis=0) - np.einsum('fip,fi->p', gain, self.pose_slopes), gain)
+                self.rig_slopes.sum(axis=0) - np.einsum('fip,fi->p', gain, self.pose_slopes),
+                np.asarray(gain, dtype=float))
 
     def pulls(self) -> tuple[Array, Array]:
         """Slope (F, P) and curvature (F, P, P) of each frame alone, its pose eliminated."""
@@ -111,7 +112,8 @@ class ArrowSystem:
     def _damped_poses(self, damping: float) -> Array:
         """The poses' blocks (F, 3, 3) that are solved with, regular whatever a frame shows."""
         diagonal = np.einsum('fii->fi', self.poses)
-        return self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
+        return np.asarray(
+            self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :])
 
 
 @dataclass(frozen=True, eq=False)
