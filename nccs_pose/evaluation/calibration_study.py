@@ -71,7 +71,7 @@ def measured_frames(
         pose = random_pose(rng)
         ideal = predict_frame(
             rig, line_map, pose, sigma=sigma, points=points, stamp_ns=len(frames),
-            parameter=_even_stations(rig, line_map, pose, points, rng))
+            along=_even_stations(rig, line_map, pose, points, rng))
         if len(ideal.lines) < 3:
             continue
         noise = sigma * rng.normal(size=ideal.points.pixels.shape)
