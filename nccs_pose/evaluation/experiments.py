@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.experiment_plots import box_figure, projection_figure
-from nccs_pose.evaluation.experiment_summary import summary_text
+from nccs_pose.evaluation.experiment_summary import Results, summary_text
 from nccs_pose.evaluation.line_projection import project_lines, projection_summary
 from nccs_pose.evaluation.trials import Answer, Cell, run_trial
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -158,8 +158,8 @@ def steps_of(name: str, options: ExperimentOptions) -> int:
 def _run_cells(
     cells: tuple[Cell, ...], trials: int, workers: int, backend: str, options: ExperimentOptions,
     progress: Callable[[str], None],
-) -> list[tuple[Cell, list[tuple[Answer, ...]]]]:
-    results = []
+) -> Results:
+    results: Results = []
     try:
         parallel = Parallel(n_jobs=workers, backend=backend)
     except ValueError as error:
