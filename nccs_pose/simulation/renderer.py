@@ -83,8 +83,8 @@ def paint(scene: Scene, pose: Pose2) -> np.ndarray:
         paint_obstacle(colours, view, obstacle, pose)
     if look.body is not None:
         cop = scene.rig.T_base_mirror.apply(scene.rig.cop)
-        index, paint_ = body_overlay(view, look.body, tuple(cop.tolist()))
-        colours[index] = paint_
+        index, own_colours = body_overlay(view, look.body, tuple(cop.tolist()))
+        colours[index] = own_colours
     image = np.empty((view.height * view.width, 3), np.float32)
     image[:] = look.surround
     image[view.pixel] = colours
