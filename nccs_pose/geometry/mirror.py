@@ -25,7 +25,7 @@ from nccs_pose.geometry.pose import Array, checked_vector
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_CONE_TOLERANCE = 1e-12
+_CONE_TOLERANCE = 1e-12  # square metres, of the squared radius: a cone's is zero but for rounding
 
 
 @dataclass(frozen=True)
