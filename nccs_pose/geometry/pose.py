@@ -38,6 +38,13 @@ def wrapped(angle: float) -> float:
     return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
+def pose_differences(poses: Array, others: Array) -> Array:
+    """Poses (..., 3) of x, y, yaw less others (..., 3), the difference of angles wrapped."""
+    difference: Array = poses - others
+    difference[..., 2] = wrap_angle(difference[..., 2])
+    return difference
+
+
 @dataclass(frozen=True)
 class Pose2:
     """A planar pose, the rigid motion (x, y, yaw): ``p_a = T_a_b.apply(p_b)``.
