@@ -36,9 +36,9 @@ from nccs_pose.geometry.small_matrices import (
     inverse_2x2,
     inverse_3x3,
     is_definite,
-    solution,
     solve_3x3,
-    solved,
+    solve_if_definite,
+    solve_symmetric,
 )
 from nccs_pose.simulation.table_one import TABLE_ONE
 import numpy as np
@@ -398,10 +398,10 @@ def test_only_positive_definite_matrices_are_solved(sizes, negative, seed):
     g = axes[0] + 0.1
     definite = not any(negative)
     for matrix in (m, np.diag(values)):
-        assert (solved(matrix, g) is not None) == definite
+        assert (solve_if_definite(matrix, g) is not None) == definite
         assert (inverse_3x3(matrix) is not None) == is_definite(matrix) == definite
         assert is_definite(matrix, values.min() - 1e-3)
         assert not is_definite(matrix, values.min() + 1e-3)
         # LAPACK takes over.
-        assert matrix @ solution(matrix, g) == pytest.approx(g, rel=1e-6, abs=1e-9)
+        assert matrix @ solve_symmetric(matrix, g) == pytest.approx(g, rel=1e-6, abs=1e-9)
         assert matrix @ inverse(matrix) == pytest.approx(np.eye(3), abs=1e-8)

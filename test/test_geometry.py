@@ -31,7 +31,7 @@ from nccs_pose.geometry import (
     wrap_angle,
 )
 from nccs_pose.geometry.pose import rotation_exp
-from nccs_pose.geometry.small_matrices import definite_solution
+from nccs_pose.geometry.small_matrices import solve_definite
 from nccs_pose.simulation.table_one import look_at, MOUNTING, TABLE_ONE
 import numpy as np
 import pytest
@@ -313,8 +313,8 @@ def test_a_definite_system_is_solved_and_another_is_refused() -> None:
     rng = np.random.default_rng(0)
     root = rng.standard_normal((4, 4))
     matrix, right = root @ root.T, rng.standard_normal((4, 3))
-    np.testing.assert_allclose(matrix @ definite_solution(matrix, right), right, atol=1e-10)
+    np.testing.assert_allclose(matrix @ solve_definite(matrix, right), right, atol=1e-10)
     np.testing.assert_allclose(
-        matrix @ definite_solution(matrix, right[:, 0]), right[:, 0], atol=1e-10)
+        matrix @ solve_definite(matrix, right[:, 0]), right[:, 0], atol=1e-10)
     with pytest.raises(np.linalg.LinAlgError):
-        definite_solution(np.diag([1.0, -1.0]), np.ones(2))
+        solve_definite(np.diag([1.0, -1.0]), np.ones(2))

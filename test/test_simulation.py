@@ -24,7 +24,6 @@ from nccs_pose.errors import SimulationError
 from nccs_pose.files.yaml_files import load_map, load_rig
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2
-from nccs_pose.simulation.coverage import half_plane_area, tape_coverage
 from nccs_pose.simulation.floor_view import floor_points, floor_view
 from nccs_pose.simulation.motion import Twist
 from nccs_pose.simulation.renderer import expected_image, render
@@ -41,6 +40,7 @@ from nccs_pose.simulation.scene import (
     Scene,
 )
 from nccs_pose.simulation.sensors import compress, expose, irradiate, SensorModel
+from nccs_pose.simulation.tape_coverage import half_plane_area, tape_coverage
 from nccs_pose.simulation.textures import wall_colours
 import numpy as np
 import pytest

@@ -88,30 +88,32 @@ class ArrowSystem:
         :returns: information on the rig (P, P), its slope (P,), and -dpose/drig (F, 3, P), how
             the poses give way to the rig.
         """
-        diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
-        gain = np.linalg.solve(poses, self.coupling)
+        gain = np.linalg.solve(self._damped_poses(damping), self.coupling)
         rig = self.rig
         rig = rig + damping * np.diag(np.diag(rig))
         return (rig - np.einsum('fip,fiq->pq', self.coupling, gain),
-                self.rig_slopes.sum(axis=0) - np.einsum('fip,fi->p', gain, self.pose_slopes), gain)
+                self.rig_slopes.sum(axis=0) - np.einsum('fip,fi->p', gain, self.pose_slopes),
+                np.asarray(gain, dtype=float))
 
     def pulls(self) -> tuple[Array, Array]:
         """Slope (F, P) and curvature (F, P, P) of each frame alone, its pose eliminated."""
-        gain = np.linalg.solve(self.poses + VAGUE_INFORMATION, self.coupling)
+        gain = np.linalg.solve(self._damped_poses(0.0), self.coupling)
         return (self.rig_slopes - np.einsum('fip,fi->fp', gain, self.pose_slopes),
                 self.rigs - np.einsum('fip,fiq->fpq', self.coupling, gain))
 
     def solve(self, theta: Array, spread: Array, damping: float) -> tuple[Array, Array]:
         """Step of the rig (P,) and of the poses (F, 3)."""
         information, slope, gain = self.reduced(damping)
-        # In units of the spread the matrix is well scaled, whatever the parameters' units.
-        scaled = information * np.outer(spread, spread) + np.eye(len(spread))
-        step = -spread * np.linalg.solve(scaled, spread * slope + theta / spread)
-        diagonal = np.einsum('fii->fi', self.poses)
-        poses = self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :]
-        alone = np.linalg.solve(poses, self.pose_slopes[:, :, None])[:, :, 0]
+        step = rig_step(information, slope, theta, spread)
+        alone = np.linalg.solve(
+            self._damped_poses(damping), self.pose_slopes[:, :, None])[:, :, 0]
         return step, -alone - gain @ step
+
+    def _damped_poses(self, damping: float) -> Array:
+        """The poses' blocks (F, 3, 3) that are solved with, regular whatever a frame shows."""
+        diagonal = np.einsum('fii->fi', self.poses)
+        return np.asarray(
+            self.poses + VAGUE_INFORMATION + damping * np.eye(3) * diagonal[:, None, :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +167,10 @@ def adjust(
     problem = Problem(parameters, observations)
     theta = np.zeros(len(parameters)) if theta is None else np.array(theta, dtype=float)
     everything = np.ones(len(observations), dtype=bool)
-    theta, poses, terms, ended, used = _descend(
-        problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
-    scale = _robust_scale(terms)
-    inlier = terms.hit & (np.abs(terms.residual) <= _GATE * scale)
+    found = _descend(problem, theta, np.array(poses, dtype=float), everything, cauchy=True)
+    converged, steps = found.converged, found.steps
+    scale = _robust_scale(found.terms)
+    inlier = found.terms.hit & (np.abs(found.terms.residual) <= _GATE * scale)
     if inlier.sum() < 3 * observations.frames + len(parameters):
         raise CalibrationError(
             f'only {int(inlier.sum())} of {len(observations)} points lie on the lines that they '
@@ -176,25 +178,41 @@ def adjust(
     for _ in range(_FEET):
         # Curves that are far from the pixels say nothing of where on them the feet would be.
         if scale <= _SOUND:
-            problem.drop_feet(theta, poses)
-        theta, poses, terms, finished, more = _descend(
-            problem, theta, poses, inlier, cauchy=False)
-        used += more
-    e = terms.residual[inlier]
+            problem.drop_feet(found.theta, found.poses)
+        found = _descend(problem, found.theta, found.poses, inlier, cauchy=False)
+        steps += found.steps
+    e = found.terms.residual[inlier]
     degrees = max(1, len(e) - 3 * observations.frames - len(parameters))
     reduced = float(e @ e) / degrees
-    system = ArrowSystem.of(terms, inlier.astype(float), problem.slices)
+    system = ArrowSystem.of(found.terms, inlier.astype(float), problem.slices)
+    shared = _shared_scatter(system, parameters.spread)
     information, _, gain = system.reduced()
     # Residuals larger than the noise was told to be widen the claim, and so do errors that the
     # points of a frame share; smaller ones do not narrow it.
-    found = pull_statistics(*system.pulls(), parameters.spread)
-    by_chance = chi2.isf(_CHANCE, max(found.degrees, 1.0)) / max(found.degrees, 1.0)
-    shared = found.scatter if found.scatter > by_chance else 1.0
     information = 0.5 * (information + information.T) / max(1.0, reduced, shared)
     return Adjustment(
-        parameters.model(theta, with_rim=True), theta, poses, information,
-        posterior(information, parameters.spread), gain, terms.residual, inlier, scale, reduced,
-        shared, ended and finished, used)
+        parameters.model(found.theta, with_rim=True), found.theta, found.poses, information,
+        posterior(information, parameters.spread), gain, found.terms.residual, inlier, scale,
+        reduced, shared, converged and found.converged, steps)
+
+
+def _shared_scatter(system: ArrowSystem, spread: Array) -> float:
+    """Scatter of the frames' pulls over that of independent noise; 1 if it is chance."""
+    found = pull_statistics(*system.pulls(), spread)
+    degrees = max(found.degrees, 1.0)
+    by_chance = float(chi2.isf(_CHANCE, degrees)) / degrees
+    return found.scatter if found.scatter > by_chance else 1.0
+
+
+def rig_step(information: Array, slope: Array, theta: Array, spread: Array) -> Array:
+    """The step (P,) from theta to the least of data and rough values together.
+
+    :param information: of the data, the poses eliminated (P, P).
+    :param slope: of half their squares there (P,).
+    """
+    # In units of the spread the matrix is well scaled, whatever the parameters' units.
+    scaled = information * np.outer(spread, spread) + np.eye(len(spread))
+    return np.asarray(-spread * np.linalg.solve(scaled, spread * slope + theta / spread))
 
 
 def posterior(information: Array, spread: Array) -> Array:
@@ -209,10 +227,28 @@ def _robust_scale(terms: Linearisation) -> float:
     return robust_scale(residual) if len(residual) else _MISSED
 
 
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """Where the method ended.
+
+    :ivar theta: deviation from the rough rig (P,).
+    :ivar poses: T_map_base of every frame (F, 3).
+    :ivar terms: residuals and derivatives there.
+    :ivar converged: whether the last step was negligible.
+    :ivar steps: how many were taken.
+    """
+
+    theta: Array
+    poses: Array
+    terms: Linearisation
+    converged: bool
+    steps: int
+
+
 def _descend(
     problem: Problem, theta: Array, poses: Array, chosen: NDArray[np.bool_], *, cauchy: bool,
-) -> tuple[Array, Array, Linearisation, bool, int]:
-    """Levenberg-Marquardt; returns where it ends, whether it converged, and the steps taken."""
+) -> _Descent:
+    """Levenberg-Marquardt over the chosen points (N,), under Cauchy's loss or least squares."""
     spread, damping = problem.parameters.spread, 0.0
     terms = problem.linearise(theta, poses)
     for iteration in range(_MOST_STEPS):
@@ -234,10 +270,10 @@ def _descend(
             damping = max(1e-3, 10.0 * damping)
         # A step of a thousandth of what the data can tell ends the search.
         if size < 1e-6:
-            return theta, poses, terms, True, iteration + 1
+            return _Descent(theta, poses, terms, True, iteration + 1)
         if damping > 1e8:
-            return theta, poses, terms, False, iteration + 1
-    return theta, poses, terms, False, _MOST_STEPS
+            break
+    return _Descent(theta, poses, terms, False, iteration + 1)
 
 
 def _squared_size(system: ArrowSystem, step: Array, pose_step: Array, spread: Array) -> float:

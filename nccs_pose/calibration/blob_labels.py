@@ -26,6 +26,7 @@ from itertools import permutations
 
 from nccs_pose.calibration.first_poses import first_pose
 from nccs_pose.calibration.observations import evenly, FrameObservation
+from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rig
@@ -40,6 +41,7 @@ _LARGEST = 4  # blobs that are tried
 _POINTS = 30  # of each blob
 _SIGMA = 1.5  # px: a blob's pixels lie all over the tape's width
 _DISTINCT = 1.15  # a second assignment must be worse by this factor
+_MASK = LocaliserOptions()  # how it tells a line's colour from its surroundings
 
 
 def label_blobs(
@@ -87,7 +89,8 @@ def _blobs(rig: Rig, line_map: LineMap, image: NDArray[np.uint8]) -> list[Array]
     """Pixels (N, 2) of the blobs of most pixels whose rays reach the floor."""
     found: list[Array] = []
     for colour in dict.fromkeys(line.colour for line in line_map):
-        mask = chromatic_mask(image, colour, 4.5, 0.05, 31)
+        mask = chromatic_mask(
+            image, colour, _MASK.noise_gate, _MASK.least_contrast, _MASK.window)
         segmentation = find_blobs(mask, _POINTS)
         sees = rig.back_project(segmentation.pixels).floor_points()[1]
         for label in range(segmentation.label.max(initial=-1) + 1):

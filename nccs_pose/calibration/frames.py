@@ -30,7 +30,7 @@ from nccs_pose.calibration.observations import FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigModel, RigParameters
 from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.problem import Problem
-from nccs_pose.geometry.pose import Array, Pose2, wrap_angle
+from nccs_pose.geometry.pose import Array, Pose2, pose_differences
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,9 +84,7 @@ def choose(frames: FrameInformation, spread: Array, most: int) -> NDArray[np.int
 
 def same_place(a: Array, b: Array) -> bool:
     """Whether two poses (3,) are of one place."""
-    off = a - b
-    off[2] = wrap_angle(off[2])
-    return bool((np.abs(off) < PLACE).all())
+    return bool((np.abs(pose_differences(a, b)) < PLACE).all())
 
 
 def count_places(poses: Array) -> int:

@@ -46,8 +46,8 @@ Image = NDArray[np.uint8]
 Images = Callable[[], Iterable[tuple[int, Image]]]
 
 _PASSES = 4
-_FEWEST = 2  # images that a better rig may be estimated from, to follow more under it
-_SOME = 30  # images that are tried by themselves, and that a rig is tried on
+_LEAST_FRAMES = 2  # images that a better rig may be estimated from, to follow more under it
+_TRIED_IMAGES = 30  # images that are tried by themselves, and that a rig is tried on
 # A rough rig fits a single image better if that image may have a height and a tilt of its own.
 _ROUGHLY = LocaliserOptions(height_sigma=0.01, tilt_sigma=0.005)
 # In the end height and tilt are what is to be found; no frame may have its own.
@@ -68,6 +68,11 @@ class Measured:
     poses: Array
     seen: int
     reasons: Counter[str]
+
+    @property
+    def usable(self) -> int:
+        """How many frames show enough lines to calibrate from."""
+        return sum(len(frame.lines) >= LEAST_LINES for frame in self.frames)
 
 
 def measure(
@@ -128,8 +133,8 @@ def calibrate_images(
                 rig, line_map, measured.frames, options, free_lines, measured.poses)
             # The noise was measured with what the last rig left in the residuals; now it is clean.
             measured = measure(result.model.rig, result.model.line_map, images())
-            if _usable(measured) == 0:
-                raise CalibrationError(_nothing(measured))
+            if measured.usable == 0:
+                raise CalibrationError(_what_is_missing(measured))
             return calibrate(rig, line_map, measured.frames, options, free_lines, measured.poses)
         except CalibrationError as error:
             refused = refused or error
@@ -169,18 +174,18 @@ def _follow(
     """
     line_map, before = parameters.rough.line_map, 0
     for _ in range(_PASSES):
-        if _usable(measured) < _FEWEST:
-            raise CalibrationError(_nothing(measured))
+        if measured.usable < _LEAST_FRAMES:
+            raise CalibrationError(_what_is_missing(measured))
         better = _refined(parameters, measured.frames, measured.poses, options)
         measured = measure(better, line_map, images())
         on_pass(f'{len(measured.frames)} of {measured.seen} images followed under a refined rig')
-        if _usable(measured) < options.min_frames:
+        if measured.usable < options.min_frames:
             measured = _measure_roughly(better, line_map, images)
         if len(measured.frames) <= before:
             break
         before = len(measured.frames)
-    if _usable(measured) < min(options.min_frames, measured.seen):
-        raise CalibrationError(_nothing(measured))
+    if measured.usable < min(options.min_frames, measured.seen):
+        raise CalibrationError(_what_is_missing(measured))
     return measured
 
 
@@ -199,11 +204,7 @@ def _measure_roughly(rig: Rig, line_map: LineMap, images: Images) -> Measured:
     return measure(rig, line_map, images(), _ROUGHLY, doubted=True)
 
 
-def _usable(measured: Measured) -> int:
-    return sum(len(frame.lines) >= LEAST_LINES for frame in measured.frames)
-
-
-def _nothing(measured: Measured) -> str:
+def _what_is_missing(measured: Measured) -> str:
     if measured.seen == 0:
         return 'there is no image to calibrate from'
     if not measured.reasons:
@@ -225,10 +226,10 @@ def _from_single_images(
     """
     if not measured.frames:
         return None
-    best, most = None, _FEWEST - 1
+    best, most = None, _LEAST_FRAMES - 1
     # Read once: every rig is tried on them.
-    some = list(islice(images(), 0, None, math.ceil(measured.seen / _SOME)))
-    for k in evenly(len(measured.frames), _SOME):
+    some = list(islice(images(), 0, None, math.ceil(measured.seen / _TRIED_IMAGES)))
+    for k in evenly(len(measured.frames), _TRIED_IMAGES):
         try:
             better = _refined(
                 parameters, measured.frames[k:k + 1], measured.poses[k:k + 1], options)

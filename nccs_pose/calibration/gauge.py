@@ -98,14 +98,12 @@ def _name(direction: Array, parameters: RigParameters, model: RigModel) -> str:
 
 def gauges(parameters: RigParameters, model: RigModel) -> list[tuple[str, Array]]:
     """Freedoms that can be foreseen: (name, (P, K)) with K moves that change no picture."""
-    found = []
     rig = model.rig
-    if 'cop_x' in parameters.index:
-        found.append(("heading of base_link (the camera pushed sideways and turned about the "
-                      "mirror's axis)", _moves(parameters, [
-                          {'cop_x': -rig.cop[1], 'camera_z': 1.0}])))
+    heading = {'cop_x': -rig.cop[1], 'camera_z': 1.0}
+    found = [("heading of base_link (the camera pushed sideways and turned about the mirror's "
+              'axis)', _moves(parameters, [heading]))]
     if rig.mirror.kind == 'sphere' and {'tilt_x', 'tilt_y'} <= parameters.index.keys():
-        arm = rig.cop + np.array([0.0, 0.0, 0.5 * rig.mirror.B])
+        arm = rig.cop - np.array([0.0, 0.0, rig.mirror.centre_z])
         moves = []
         for axis in np.eye(3)[:2]:
             shift = np.cross(axis, arm)
@@ -114,9 +112,8 @@ def gauges(parameters: RigParameters, model: RigModel) -> list[tuple[str, Array]
                 'cop_x': shift[0], 'cop_y': shift[1], 'cop_z': shift[2], 'camera_x': axis[0],
                 'camera_y': axis[1], 'tilt_x': tilt[0], 'tilt_y': tilt[1]})
         # Any heading of base_link comes with it.
-        moves.append({'cop_x': -rig.cop[1], 'camera_z': 1.0})
         found.append(("turn of the mirror frame about the sphere's centre", _moves(
-            parameters, moves)))
+            parameters, [*moves, heading])))
     mirror = rig.mirror
     if {'mirror_C', 'cop_z', 'height'} <= parameters.index.keys():
         # Size of mirror and camera's distance together: the rays turn not at all and shift by

@@ -41,7 +41,7 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
-from nccs_pose.calibration.adjustment import ArrowSystem
+from nccs_pose.calibration.adjustment import ArrowSystem, rig_step
 from nccs_pose.calibration.frames import same_place
 from nccs_pose.calibration.gauge import pose_uncertainty
 from nccs_pose.calibration.observations import (
@@ -66,6 +66,7 @@ import numpy as np
 from scipy.stats import f as fisher
 
 _GATE = 4.0  # robust standard deviations of a frame
+_LEAST_POINTS = 12  # fewer tell a frame's outliers from its noise by chance only
 # By so many places, and points of each line, the parts that may have moved are told apart.
 _WITNESSES, _WITNESS_POINTS = 16, 20
 _STEPS = 3
@@ -194,7 +195,7 @@ class CalibrationMonitor:
         here, as_told = pose.as_array(), np.zeros(len(self._parameters))
         problem.drop_feet(as_told, here[None])
         terms = problem.linearise(as_told, here[None])
-        if terms.hit.sum() < 12:
+        if terms.hit.sum() < _LEAST_POINTS:
             return
         scale = robust_scale(terms.residual[terms.hit])
         # Least squares over what is no outlier: a weight that falls with the residual would make
@@ -221,7 +222,8 @@ class CalibrationMonitor:
         curvatures = np.array([place.information for place in self._places])
         statistic, limit = self._regularity(slopes, curvatures)
         pull, information = slopes.sum(axis=0), curvatures.sum(axis=0)
-        step = self._step(pull, information)
+        spread = self._parameters.spread
+        step = rig_step(information, pull, np.zeros(len(spread)), spread)
         error = self._pose_error(step)
         if statistic <= limit:
             words = f'calibration good: residuals from {places} places are noise'
@@ -244,12 +246,6 @@ class CalibrationMonitor:
         limit = found.freedom * float(
             fisher.isf(self.options.false_alarm, found.freedom, len(slopes) - 1))
         return found.squared / max(1.0, found.scatter), limit
-
-    def _step(self, pull: Array, information: Array) -> Array:
-        """What change of the rig (P,) the pulls ask for."""
-        spread = self._parameters.spread
-        scaled = information * np.outer(spread, spread) + np.eye(len(spread))
-        return np.asarray(-spread * np.linalg.solve(scaled, spread * pull))
 
     def _pose_error(self, step: Array) -> float:
         gains = np.array([place.gain for place in self._places])

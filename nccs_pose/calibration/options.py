@@ -69,6 +69,5 @@ class CalibrationOptions:
         5e-3, unit='m', low=1e-6, high=1.0,
         doc='Largest pose error that the remaining uncertainty may mean.')
 
-
     def __post_init__(self) -> None:
         check_options(self)

@@ -26,24 +26,23 @@ import numpy as np
 
 def predict_frame(
     rig: Rig, line_map: LineMap, pose: Pose2, *, sigma: float, points: int = 75, stamp_ns: int = 0,
-    parameter: Array | None = None,
+    along: Array | None = None,
 ) -> FrameObservation:
     """Noise-free points on both edges of every line, where the mirror shows them.
 
     :param sigma: standard deviation to give them, px; it is not applied.
     :param points: how many of each line, both edges together (a line without a width: all on
         its middle).
-    :param parameter: where along the lines, 0 at the start to 1 at the end: (points,) for all of
+    :param along: where along the lines, 0 at the start to 1 at the end: (points,) for all of
         them, or (L, points), each its own; None: evenly.
     """
-    where = np.linspace(0.0, 1.0, points) if parameter is None else parameter
+    stations = np.linspace(0.0, 1.0, points) if along is None else along
     world, label, side = [], [], []
-    for index, (line, along) in enumerate(
-            zip(line_map, np.broadcast_to(where, (len(line_map), points)))):
+    for index, (line, share) in enumerate(
+            zip(line_map, np.broadcast_to(stations, (len(line_map), points)))):
         sides = np.where(np.arange(points) % 2, 1, -1) if line.width > 0.0 else np.zeros(points)
-        left = np.cross([0.0, 0.0, 1.0], line.direction)
-        world.append(line.start + along[:, None] * (line.end - line.start)
-                     + (0.5 * line.width * sides)[:, None] * left)
+        world.append(line.start + share[:, None] * (line.end - line.start)
+                     + (0.5 * line.width * sides)[:, None] * line.left)
         label.append(np.full(points, index))
         side.append(sides)
     pixels, seen = rig.project(pose.inverse().apply(np.concatenate(world)))

@@ -149,10 +149,10 @@ def outline_points(rig: Rig, count: int = _POINTS) -> Array:
     if rim_is_seen(rig):
         points = rim_points(rig, count)
     elif rig.mirror.kind == 'sphere':
-        centre = np.array([0.0, 0.0, -0.5 * rig.mirror.B])
+        centre = np.array([0.0, 0.0, rig.mirror.centre_z])
         to_camera = rig.cop - centre
         distance = float(np.linalg.norm(to_camera))
-        squared = rig.mirror.C + 0.25 * rig.mirror.B**2
+        squared = rig.mirror.squared_radius
         along = to_camera / distance
         across = np.linalg.svd(along[None])[2][1:]
         radius = np.sqrt(squared * (1.0 - squared / distance**2))
@@ -188,8 +188,7 @@ def _placed_sphere(rig: Rig, directions: Array) -> Rig | None:
     cosine = 1.0 / float(np.linalg.norm(scaled))
     if cosine >= 1.0:
         return None
-    squared = rig.mirror.C + 0.25 * rig.mirror.B**2
-    distance = np.sqrt(squared / (1.0 - cosine**2))
+    distance = np.sqrt(rig.mirror.squared_radius / (1.0 - cosine**2))
     to_camera = -rig.R_mirror_camera @ (distance * cosine * scaled)
     # The camera's direction is the rough one's; so that it stays at x = 0, turn it about the
     # sphere's centre by as little as will do.
@@ -198,7 +197,7 @@ def _placed_sphere(rig: Rig, directions: Array) -> Rig | None:
     sine = float(np.linalg.norm(axis)) / float(
         np.linalg.norm(to_camera) * np.linalg.norm(in_plane))
     turn = rotation_exp(axis * (np.arcsin(sine) / max(float(np.linalg.norm(axis)), 1e-30)))
-    cop = turn @ to_camera - np.array([0.0, 0.0, 0.5 * rig.mirror.B])
+    cop = turn @ to_camera + np.array([0.0, 0.0, rig.mirror.centre_z])
     cop[0] = 0.0  # but for rounding
     return _built(rig, cop, turn @ rig.R_mirror_camera)
 

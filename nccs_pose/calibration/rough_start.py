@@ -29,7 +29,7 @@ from nccs_pose.calibration.first_poses import first_poses
 from nccs_pose.calibration.observations import evenly, FrameObservation, Observations
 from nccs_pose.calibration.parameters import RigParameters
 from nccs_pose.errors import CalibrationError, GeometryError
-from nccs_pose.geometry.pose import Array, wrap_angle
+from nccs_pose.geometry.pose import Array, pose_differences
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,7 +48,6 @@ class Start:
     :ivar adjustment: over the frames that are used.
     :ivar used: indices of those frames.
     :ivar agreement: fraction of all frames that the rig explains.
-    :ivar settled: whether rig and poses agree well enough to be believed.
     """
 
     adjustment: Adjustment
@@ -158,6 +157,5 @@ def _settle(
 
 def _moved(before: Array, after: Array) -> NDArray[np.bool_]:
     """Which poses (F, 3) changed by more than a few centimetres or degrees."""
-    change = after - before
-    change[:, 2] = wrap_angle(change[:, 2])
+    change = pose_differences(after, before)
     return np.asarray(~(np.abs(change) < 0.03).all(axis=1))  # a pose that is new has moved

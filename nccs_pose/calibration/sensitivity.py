@@ -103,17 +103,12 @@ def side_sensitivity(
     :param incident: of this camera and these pixels, if they are at hand.
     """
     incident = incident or IncidentRays.of(rig.camera, observations.pixels)
-    mirror, frame = rig.mirror, observations.frame
-    v = incident.direction @ rig.R_mirror_camera.T
-    m, hit = mirror.intersect(rig.cop, v)
-    n = mirror.normal(m)
-    vn, nn = np.where(hit, _dot(v, n), 1.0), np.where(hit, _dot(n, n), 1.0)
-    k = vn / nn
-    r = v - (2.0 * k)[:, None] * n
+    frame, reflection = observations.frame, _Reflection(rig, incident)
+    m = reflection.m
 
     turn = _yaw_matrices(poses[:, 2])
     to_map = (turn @ rig.T_base_mirror.rotation)[frame]
-    r_map, arm = _rotate(to_map, r), _rotate(to_map, m)
+    r_map, arm = _rotate(to_map, reflection.r), _rotate(to_map, m)
     from_base = _rotate(turn[frame], np.broadcast_to(rig.T_base_mirror.translation, m.shape)) + arm
     m_map = from_base.copy()
     m_map[:, :2] += poses[frame, :2]
@@ -130,25 +125,49 @@ def side_sensitivity(
     tape = line.derivatives(r_map, m_map)
 
     to_mirror = np.swapaxes(to_map, 1, 2)
-    a, b = _rotate(to_mirror, a), _rotate(to_mirror, b)
-    share = _dot(a, n) / nn
-    a_v = a - (2.0 * share)[:, None] * n
-    a_n = -2.0 * (share[:, None] * r + k[:, None] * a)
-    b = b + a_n * [1.0, 1.0, mirror.A]
-    q = _dot(b, v) / vn
-    cop = b - q[:, None] * n
-    by_v = a_v + np.linalg.norm(m - rig.cop, axis=1)[:, None] * cop
-    z = m[:, 2]
-    by_mirror = np.stack(
-        [(a_n[:, 2] - 0.5 * q * z) * z, 0.5 * (a_n[:, 2] - q * z), 0.5 * q], axis=1)
+    by_v, cop, by_mirror = reflection.back(_rotate(to_mirror, a), _rotate(to_mirror, b))
     pixel = np.einsum('ni,nij->nj', by_v @ rig.R_mirror_camera, incident.jacobian)
-    hit = hit & (np.abs(pixel).max(axis=1, initial=0.0) > _TINY)
-    columns = (side, pixel, pose, cop, np.cross(v, by_v), by_mirror, mounting_rotation,
-               mounting_translation, *tape)
+    hit = reflection.hit & (np.abs(pixel).max(axis=1, initial=0.0) > _TINY)
+    columns = (side, pixel, pose, cop, np.cross(reflection.v, by_v), by_mirror,
+               mounting_rotation, mounting_translation, *tape)
     if not hit.all():
         for array in columns:
             array[~hit] = 0.0
     return Sensitivity(columns[0], hit, *columns[1:])
+
+
+class _Reflection:
+    """Rays reflected in the mirror frame, and the chain rule back through that (see the module).
+
+    :ivar v: unit incident directions (N, 3).
+    :ivar m: mirror points (N, 3), metres.
+    :ivar r: unit reflected directions (N, 3).
+    :ivar hit: whether there is a mirror point (N,); where not, the rest has no meaning.
+    """
+
+    def __init__(self, rig: Rig, incident: IncidentRays) -> None:
+        self._mirror, self._cop = rig.mirror, rig.cop
+        self.v = incident.direction @ rig.R_mirror_camera.T
+        self.m, self.hit = rig.mirror.intersect(rig.cop, self.v)
+        self._n = n = rig.mirror.normal(self.m)
+        self._vn = np.where(self.hit, _dot(self.v, n), 1.0)
+        self._nn = np.where(self.hit, _dot(n, n), 1.0)
+        self._k = self._vn / self._nn
+        self.r = self.v - (2.0 * self._k)[:, None] * n
+
+    def back(self, a: Array, b: Array) -> tuple[Array, Array, Array]:
+        """dS/dv, dS/do and dS/d(A, B, C), each (N, 3), from a = dS/dr and b = dS/dm (N, 3)."""
+        n, z = self._n, self.m[:, 2]
+        share = _dot(a, n) / self._nn
+        a_v = a - (2.0 * share)[:, None] * n
+        a_n = -2.0 * (share[:, None] * self.r + self._k[:, None] * a)
+        b = b + a_n * [1.0, 1.0, self._mirror.A]
+        q = _dot(b, self.v) / self._vn
+        by_cop = b - q[:, None] * n
+        t = np.linalg.norm(self.m - self._cop, axis=1)
+        by_mirror = np.stack(
+            [(a_n[:, 2] - 0.5 * q * z) * z, 0.5 * (a_n[:, 2] - q * z), 0.5 * q], axis=1)
+        return a_v + t[:, None] * by_cop, by_cop, by_mirror
 
 
 class EdgeLines:
@@ -161,10 +180,9 @@ class EdgeLines:
     def __init__(
         self, line_map: LineMap, index: NDArray[np.intp], side: NDArray[np.int8],
     ) -> None:
-        left = np.cross([0.0, 0.0, 1.0], line_map.directions)
         # A line that stands upright has no left; nothing of it can be shifted that way.
         self.direction = line_map.directions[index]
-        self.left = left[index]
+        self.left = line_map.lefts[index]
         self.half_side = 0.5 * side
         shift = self.half_side * line_map.widths[index]
         self.middle = (0.5 * (line_map.starts + line_map.ends))[index] + shift[:, None] * self.left

@@ -24,7 +24,7 @@ from nccs_pose.estimation.observability import unobserved_directions
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.shift_solve import WeighedShifts
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.small_matrices import solution
+from nccs_pose.geometry.small_matrices import solve_symmetric
 from nccs_pose.vision.bands import Bands, runs
 from nccs_pose.vision.colour import LineColour
 from nccs_pose.vision.line_points import LinePoints
@@ -190,4 +190,4 @@ def leaves_open(refinement: Refinement) -> bool:
 def close(a: Pose2, b: Pose2, covariance: Array, sigmas: float) -> bool:
     """Whether two poses agree within so many standard deviations of a covariance (3, 3)."""
     difference = a.minus(b)
-    return float(difference.dot(solution(covariance, difference))) <= sigmas**2
+    return float(difference.dot(solve_symmetric(covariance, difference))) <= sigmas**2

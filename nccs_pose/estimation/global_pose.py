@@ -34,7 +34,7 @@ from nccs_pose.estimation.observability import Unobserved, unobserved_directions
 from nccs_pose.estimation.pose_monomials import gram, monomials, monomials_jacobian
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
-from nccs_pose.geometry.small_matrices import inverse, inverse_3x3, solved
+from nccs_pose.geometry.small_matrices import inverse, inverse_3x3, solve_if_definite
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -200,7 +200,7 @@ def _polished(data: LabelledRays, weights: Array, pose: Pose2) -> _Found:
     weighted = jacobian * weights
     information = weighted @ jacobian.T
     slope = weighted @ (monomials(pose) @ data.rows)
-    step = solved(information, slope)
+    step = solve_if_definite(information, slope)
     if step is None:
         values, vectors = np.linalg.eigh(information)
         # Where the rays say nothing the pose stays.

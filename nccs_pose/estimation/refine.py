@@ -26,7 +26,7 @@ from nccs_pose.estimation.robust import CAUCHY, GATE, robust_scale, VAGUE_INFORM
 from nccs_pose.estimation.side_form import SideForm
 from nccs_pose.geometry.pose import Array, Pose2
 from nccs_pose.geometry.rig import Rays
-from nccs_pose.geometry.small_matrices import inverse, solution
+from nccs_pose.geometry.small_matrices import inverse, solve_symmetric
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,7 +131,7 @@ def _descend(
         weighted = point.jacobian.T * weight
         normal = weighted @ point.jacobian + VAGUE_INFORMATION
         damped = normal + damping * np.diag(np.diag(normal)) if damping else normal
-        step = solution(damped, weighted @ e)
+        step = solve_symmetric(damped, weighted @ e)
         unknowns = point.unknowns - step
         trial = _Point(unknowns, *form.residual(unknowns))
         if _loss(trial.e, trusted, width) <= _loss(e, trusted, width):

@@ -29,7 +29,7 @@ from nccs_pose.estimation.common_errors import common_variance, sums_of_neighbou
 from nccs_pose.estimation.refine import Refinement
 from nccs_pose.estimation.robust import CAUCHY, GATE, robust_variance, VAGUE_INFORMATION
 from nccs_pose.geometry.pose import Array, Pose2
-from nccs_pose.geometry.small_matrices import definite_solution
+from nccs_pose.geometry.small_matrices import solve_definite
 from nccs_pose.vision.bands import runs
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ class WeighedShifts:
         # The prior's share is weighed against residuals of the size that they have.
         e = (right_side - fitted.dot(right + self.told).dot(self.rows)) * self.root
         inflation = max(common_variance(e, leverage, self.label, self.first) / held**2, 1e-6)
-        covariance = definite_solution(
+        covariance = solve_definite(
             normal / inflation + self.known, _ONE[:len(self.free), :len(self.free)])
         unknowns = covariance @ (right / inflation + self.told)
         if self.image_sigma is not None:
@@ -120,7 +120,7 @@ class WeighedShifts:
         """
         weighed = self.rows * self.root
         normal = weighed.dot(weighed.T)
-        fitted = definite_solution(
+        fitted = solve_definite(
             normal + self.known, _ONE[:len(self.free), :len(self.free)])
         leverage = (fitted.dot(weighed) * weighed).sum(axis=0)
         # Of the biweight, psi' over the weight is 5 - 4 / root.
@@ -197,7 +197,7 @@ def _robust(equations: Array, known: Array, told: Array) -> Array:
         weighed = (equations * weight).dot(equations.T)
         normal = weighed[:-1, :-1] + known
         before = unknowns
-        unknowns = definite_solution(normal, weighed[:-1, -1] + told)
+        unknowns = solve_definite(normal, weighed[:-1, -1] + told)
         e = _residual(equations, unknowns)
         step = unknowns - before
         if step.dot(normal).dot(step) < _FOUND:

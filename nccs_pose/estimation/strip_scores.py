@@ -25,7 +25,7 @@ from nccs_pose.estimation.strip_pairs import BEYOND, FloorLines, StripLines
 from nccs_pose.geometry.floor_scale import FloorScale
 from nccs_pose.geometry.floor_table import Complex
 from nccs_pose.geometry.pose import Array
-from nccs_pose.geometry.small_matrices import definite_solutions
+from nccs_pose.geometry.small_matrices import solve_each_definite
 import numpy as np
 from numpy.typing import NDArray
 
@@ -173,7 +173,7 @@ class StripScorer:
             rows[:, 2] = (normal * turned.conj()).imag
             np.multiply(across, weight, out=rows[:, 3])
             products = rows @ rows.transpose(0, 2, 1)
-            change = definite_solutions(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
+            change = solve_each_definite(products[:, :3, :3] + _DAMPING, products[:, :3, 3])
             change[on.sum(axis=1) < _LEAST_SAMPLES] = 0.0
             poses = Poses(poses.rotation * np.exp(-1j * change[:, 2]),
                           poses.place - change[:, 0] - 1j * change[:, 1])

@@ -16,12 +16,12 @@
 
 from __future__ import annotations
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from nccs_pose.calibration.gauge import amount, deviation
 from nccs_pose.calibration.judgement import robust_deviation
 from nccs_pose.calibration.parameters import Parameter
 from nccs_pose.calibration.procedure import Calibration
+from nccs_pose.evaluation.plots import new_figure
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.rig import Rig
 import numpy as np
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 _STRONG = 0.9  # correlations that are named
 _HELD = 0.9  # of its spread: a number that the data did not narrow
+_DPI = 120
 _CELLS = 12  # of the residual map, each way
 
 
@@ -171,8 +172,7 @@ def _both(c: Calibration) -> tuple[Array, Array, Array]:
 
 def _residual_maps(c: Calibration, *, over_mirror: bool) -> Figure:
     pixels, before, after = _both(c)
-    figure = Figure(figsize=(11.0, 4.6), dpi=120, layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = new_figure(11.0, 4.6, _DPI)
     for axes, residual, rig, name in zip(
             figure.subplots(1, 2), (before, after), (c.parameters.rough.rig, c.model.rig),
             ('before', 'after')):
@@ -213,8 +213,7 @@ def cell_means(at: Array, residual: Array, cells: int = _CELLS) -> tuple[Array, 
 
 
 def _histograms(c: Calibration) -> Figure:
-    figure = Figure(figsize=(9.0, 3.6), dpi=120, layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.0, 3.6, _DPI)
     for axes, judged, name in zip(
             figure.subplots(1, 2), (c.fit, c.held_out), ('in the fit', 'held out')):
         before, after = (_finite(judged.residual_before), _finite(judged.residual_after))
@@ -240,8 +239,7 @@ def _correlation_map(c: Calibration) -> Figure:
     names = [c.parameters.parameters[i].name for i in seen]
     matrix = (c.seen_covariance / np.outer(
         np.where(sigma > 0.0, sigma, 1.0), np.where(sigma > 0.0, sigma, 1.0)))[np.ix_(seen, seen)]
-    figure = Figure(figsize=(5.6, 5.0), dpi=120, layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = new_figure(5.6, 5.0, _DPI)
     axes = figure.add_subplot()
     drawn = axes.imshow(matrix, cmap='RdBu_r', vmin=-1.0, vmax=1.0)
     figure.colorbar(drawn, ax=axes, label='correlation')

@@ -33,13 +33,12 @@ from nccs_pose.calibration.prediction import predict_frame
 from nccs_pose.calibration.problem import Problem
 from nccs_pose.calibration.procedure import calibrate
 from nccs_pose.errors import CalibrationError, GeometryError
-from nccs_pose.geometry.camera import PinholeCamera
 from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.pose import Array, Pose2, RigidTransform, rotation_exp
 from nccs_pose.geometry.rig import Rig
 from nccs_pose.simulation.scene import arena_map, arena_rig
-from nccs_pose.simulation.table_one import look_at, TABLE_ONE
+from nccs_pose.simulation.table_one import CAMERA, look_at, TABLE_ONE
 import numpy as np
 from scipy.stats import chi2
 
@@ -72,7 +71,7 @@ def measured_frames(
         pose = random_pose(rng)
         ideal = predict_frame(
             rig, line_map, pose, sigma=sigma, points=points, stamp_ns=len(frames),
-            parameter=_even_stations(rig, line_map, pose, points, rng))
+            along=_even_stations(rig, line_map, pose, points, rng))
         if len(ideal.lines) < 3:
             continue
         noise = sigma * rng.normal(size=ideal.points.pixels.shape)
@@ -136,13 +135,12 @@ def random_rig(kind: str, rng: Random) -> Rig:
         like.mirror.A, scale * like.mirror.B, scale**2 * like.mirror.C)
     cop = scale * like.cop + np.array([0.0, *rng.uniform(-3e-3, 3e-3, 2)])
     aim = rotation_exp(np.deg2rad(rng.uniform(-2.0, 2.0, 3)))
-    camera = PinholeCamera(1200, 800, 750.0, 750.0, 599.5, 399.5)
     mounting = RigidTransform.from_rpy(
         [np.pi + np.deg2rad(rng.uniform(-1, 1)), np.deg2rad(rng.uniform(-1, 1)),
          rng.uniform(-np.pi, np.pi)],
         [rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1), rng.uniform(0.6, 0.9)])
     rotation = look_at(cop, np.array([0.0, 0.0, mirror.apex_z])) @ aim
-    return Rig(mirror, camera, cop, rotation, mounting)
+    return Rig(mirror, CAMERA, cop, rotation, mounting)
 
 
 @dataclass(frozen=True)
@@ -215,6 +213,52 @@ def cop_bound(
     return np.asarray(np.sqrt(np.diag(covariance)[rows]))
 
 
+@dataclass(frozen=True, eq=False)
+class Target:
+    """One rig that was known to be off, and calibrated.
+
+    :ivar before: pose bias under the rough rig, mm.
+    :ivar after: under the refined one, mm.
+    :ivar cop: error of the camera's place (y, z) (2,), micrometres.
+    :ivar bound: its Cramer-Rao bound (2,), micrometres.
+    :ivar squared: squared errors in standard deviations, over the well seen directions.
+    :ivar freedom: how many directions those are.
+    :ivar seconds: processor time of the calibration.
+    """
+
+    before: float
+    after: float
+    cop: Array
+    bound: Array
+    squared: float
+    freedom: int
+    seconds: float
+
+
+def run_target(
+    true: Rig, options: CalibrationOptions, drive: int, points: int, rng: Random,
+) -> Target:
+    """Calibrate a rig of which each number is off by as much as a ruler is.
+
+    :param drive: images that the frames are chosen of.
+    :param points: of each line.
+    """
+    line_map, rough = arena_map(), off_in_each(true, rng)
+    frames, poses = measured_frames(true, line_map, drive, rng, points=points)
+    start = time.process_time()
+    found = calibrate(rough, line_map, frames, options)
+    seconds = time.process_time() - start
+    rig, result, used = found.model.rig, found.adjustment, found.observations
+    before = 1e3 * pose_bias(rough, true, line_map, rng).position
+    after = 1e3 * pose_bias(rig, true, line_map, rng).position
+    bound = cop_bound(true, line_map, options, used, poses[list(used.stamps_ns)])
+    squared, freedom = squared_errors(
+        result.theta, deviation_of(true, found.parameters), result.information,
+        found.parameters.spread)
+    return Target(before, after, 1e6 * (rig.cop[1:] - true.cop[1:]), 1e6 * bound, squared,
+                  freedom, seconds)
+
+
 def targets(
     kinds: Sequence[str], rigs: int, first: int, mounting: bool, drive: int, points: int,
 ) -> None:
@@ -224,41 +268,32 @@ def targets(
     :param drive: images of which the 20 are chosen, every fifth of them held out.
     :param points: of each line.
     """
-    line_map = arena_map()
     options = CalibrationOptions(height=mounting, tilt=mounting, max_frames=_FRAMES)
     for kind in kinds:
-        before, after, cop, bound, seconds = [], [], [], [], []
-        total, freedom = 0.0, 0
-        for seed in range(first, first + rigs):
-            rng = np.random.default_rng(seed)
-            true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
-            rough = off_in_each(true, rng)
-            frames, poses = measured_frames(true, line_map, drive, rng, points=points)
-            start = time.process_time()
-            found = calibrate(rough, line_map, frames, options)
-            seconds.append(time.process_time() - start)
-            rig, result = found.model.rig, found.adjustment
-            before.append(1e3 * pose_bias(rough, true, line_map, rng).position)
-            after.append(1e3 * pose_bias(rig, true, line_map, rng).position)
-            cop.append(1e6 * (rig.cop[1:] - true.cop[1:]))
-            used = found.observations
-            bound.append(1e6 * cop_bound(
-                true, line_map, options, used, poses[list(used.stamps_ns)]))
-            one, k = squared_errors(
-                result.theta, deviation_of(true, found.parameters), result.information,
-                found.parameters.spread)
-            total, freedom = total + one, freedom + k
-        low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
-        far, small = np.array(before) > 100.0, np.array(after) < 0.5
-        rms, least = (np.sqrt(np.mean(np.square(e), axis=0)) for e in (cop, bound))
-        print(f'{kind}: {rigs} rigs; pose bias, median (worst) {np.median(before):.0f} '
-              f'({max(before):.0f}) -> {np.median(after):.3f} ({max(after):.3f}) mm, below 0.5 mm '
-              f'{small.sum()} of {rigs}; of the '
-              f'{far.sum()} that begin above 100 mm the worst ends at '
-              f'{max(np.array(after)[far], default=0.0):.3f} mm; COP rms {rms[0]:.1f} and '
-              f'{rms[1]:.1f} um, Cramer-Rao bound {least[0]:.1f} and {least[1]:.1f} um; chi2 per '
-              f'degree {total / freedom:.3f} of {freedom} (95 % band {low:.3f} to {high:.3f}); '
-              f'CPU {np.median(seconds):.2f} s, worst {max(seconds):.2f} s', flush=True)
+        true = arena_rig() if kind == 'arena' else TABLE_ONE[kind]
+        found = [
+            run_target(true, options, drive, points, np.random.default_rng(seed))
+            for seed in range(first, first + rigs)]
+        print(f'{kind}: {_told(found)}', flush=True)
+
+
+def _told(found: Sequence[Target]) -> str:
+    """What the targets of one kind of rig come to."""
+    before, after = np.array([t.before for t in found]), np.array([t.after for t in found])
+    seconds = [t.seconds for t in found]
+    total, freedom = sum(t.squared for t in found), sum(t.freedom for t in found)
+    low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
+    far, small = before > 100.0, after < 0.5
+    rms = np.sqrt(np.mean(np.square([t.cop for t in found]), axis=0))
+    least = np.sqrt(np.mean(np.square([t.bound for t in found]), axis=0))
+    return (
+        f'{len(found)} rigs; pose bias, median (worst) {np.median(before):.0f} '
+        f'({before.max():.0f}) -> {np.median(after):.3f} ({after.max():.3f}) mm, below 0.5 mm '
+        f'{small.sum()} of {len(found)}; of the {far.sum()} that begin above 100 mm the worst '
+        f'ends at {after[far].max(initial=0.0):.3f} mm; COP rms {rms[0]:.1f} and {rms[1]:.1f} um, '
+        f'Cramer-Rao bound {least[0]:.1f} and {least[1]:.1f} um; chi2 per degree '
+        f'{total / freedom:.3f} of {freedom} (95 % band {low:.3f} to {high:.3f}); '
+        f'CPU {np.median(seconds):.2f} s, worst {max(seconds):.2f} s')
 
 
 def rough_starts(kinds: Sequence[str], rigs: int, first: int) -> None:

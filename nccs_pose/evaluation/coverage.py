@@ -42,7 +42,6 @@ from nccs_pose.estimation.odometry import Wheels
 from nccs_pose.estimation.options import LocaliserOptions
 from nccs_pose.evaluation.metrics import Consistency, consistency, expected_coverage, Statistic
 from nccs_pose.evaluation.tables import table
-from nccs_pose.geometry.lines import LineMap
 from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Obstacle, Scene
@@ -107,24 +106,15 @@ class Covered:
 
 
 def _ideal(width: int, noise: float, **sensor: Any) -> Callable[[], Scene]:
-    return lambda: _with_sensor(ideal_scene(width, noise), **sensor)
+    return lambda: ideal_scene(width, noise).with_sensor(**sensor)
 
 
 def _arena(width: int, **sensor: Any) -> Callable[[], Scene]:
-    return lambda: _with_sensor(arena_scene(width), **sensor)
-
-
-def _with_sensor(scene: Scene, **changes: Any) -> Scene:
-    return dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, **changes))
+    return lambda: arena_scene(width).with_sensor(**sensor)
 
 
 def _parallel() -> Scene:
-    """The ideal arena, its northern tape turned until it is parallel to the southern one."""
-    scene = ideal_scene(640, 0.02)
-    south, east, north, west = scene.line_map
-    half, middle = 0.5 * north.length * south.direction, 0.5 * (north.start + north.end)
-    turned = dataclasses.replace(north, start=middle + half, end=middle - half)
-    return dataclasses.replace(scene, line_map=LineMap((south, east, turned, west)))
+    return ideal_scene(640, 0.02).with_parallel_tapes()
 
 
 SCENARIOS = (
@@ -213,9 +203,7 @@ def _peopled(scene: Scene, count: int, pose: Pose2, rng: np.random.Generator) ->
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.6, 1.2)
         people.append(Obstacle(
             pose.x + distance * math.cos(angle), pose.y + distance * math.sin(angle), 0.2, 1.7))
-    look = scene.appearance
-    look = dataclasses.replace(look, obstacles=(*look.obstacles, *people))
-    return dataclasses.replace(scene, appearance=look)
+    return scene.with_things(people)
 
 
 def _second_image(
@@ -232,8 +220,7 @@ def _second_image(
     localiser.add_odometry(0, pose)
     localiser.process(0, render(scene, pose, rng))
     localiser.add_odometry(_FRAME_NS, told)
-    kept = LineMap(tuple(line for line in scene.line_map if line.name in seen))
-    image = render(dataclasses.replace(scene, line_map=kept), there, rng)
+    image = render(scene.with_tapes(*seen), there, rng)
     return there, localiser.process(_FRAME_NS, image)
 
 

@@ -18,17 +18,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from mpl_toolkits.mplot3d import Axes3D
 from nccs_pose.evaluation.experiment_summary import Results
 from nccs_pose.evaluation.line_projection import ProjectedScenes
+from nccs_pose.evaluation.plots import new_figure
 from nccs_pose.evaluation.trials import Answer, Cell
 from nccs_pose.geometry.pose import Array
 from nccs_pose.geometry.reflection_curve import Branch
 import numpy as np
 
+_DPI = 90  # the figures are large
 _COLOURS = {
     'paper': '#c8372d', 'paper without g2': '#e39a3b', 'ours': '#1f5fa8', 'bound': '#7f7f7f'}
 _LINE_COLOURS = ('#1f5fa8', '#c8372d', '#2e9e44', '#8a4fb0', '#d08a00')
@@ -48,7 +49,7 @@ def box_figure(title: str, axis: str, results: Results) -> Figure:
     noise most errors are rounding alone: a box that lies below the axis is a mark on it.
     """
     mirrors = list(dict.fromkeys(cell.mirror for cell, _ in results))
-    figure = _figure(5.2 * len(mirrors), 8.0)
+    figure = new_figure(5.2 * len(mirrors), 8.0, _DPI)
     axes = figure.subplots(2, len(mirrors), squeeze=False, sharex='col', sharey='row')
     for column, mirror in enumerate(mirrors):
         mine = [(cell, answers) for cell, answers in results if cell.mirror == mirror]
@@ -107,7 +108,7 @@ def _is_noisy(cell: Cell) -> bool:
 
 def projection_figure(scenes: list[ProjectedScenes]) -> Figure:
     """Lines in space, their curves on the mirror with the points, the branches of one line."""
-    figure, count = _figure(5.0 * len(scenes), 13.5), len(scenes)
+    figure, count = new_figure(5.0 * len(scenes), 13.5, _DPI), len(scenes)
     for column, scene in enumerate(scenes):
         top = figure.add_subplot(3, count, column + 1, projection='3d')
         _draw_lines(top, scene)
@@ -178,9 +179,3 @@ def _unbroken(curve: Array, jump: float) -> list[Array]:
         return []
     gaps = np.flatnonzero(np.linalg.norm(np.diff(curve, axis=0), axis=1) > jump) + 1
     return np.split(curve, gaps)
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=90, layout='constrained')
-    FigureCanvasAgg(figure)
-    return figure

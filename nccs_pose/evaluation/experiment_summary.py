@@ -24,6 +24,7 @@ from nccs_pose.evaluation.trials import Answer, Cell
 import numpy as np
 
 Results = list[tuple[Cell, list[tuple[Answer, ...]]]]
+"""Each cell of an experiment with its trials, each of them one answer an estimator."""
 # Median of chi-square with 3 degrees of freedom: the NEES of an estimator at the bound.
 _MEDIAN_CHI2_3 = 2.366
 

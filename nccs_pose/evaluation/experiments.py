@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 from nccs_pose.errors import OptionError
 from nccs_pose.evaluation.experiment_options import ExperimentOptions
 from nccs_pose.evaluation.experiment_plots import box_figure, projection_figure
-from nccs_pose.evaluation.experiment_summary import summary_text
+from nccs_pose.evaluation.experiment_summary import Results, summary_text
 from nccs_pose.evaluation.line_projection import project_lines, projection_summary
 from nccs_pose.evaluation.trials import Answer, Cell, run_trial
 from nccs_pose.simulation.table_one import TABLE_ONE
@@ -39,7 +39,8 @@ LINE_PROJECTION = 'line-projection'
 _PIXEL_LEVELS = tuple(range(11))  # px
 _WORLD_LEVELS = tuple(range(11))  # cm
 _LINE_LEVELS = (4, 6, 8, 10, 15, 20)
-_BLIND_POINTS = {4: 75, 5: 20}  # four lines on the floor, five in space
+_BLIND_POINTS = {4: 75, 5: 20}  # a line; four lines on the floor, five in space
+_BLIND_ON_FLOOR = 4
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Experiment:
     :ivar points: points per line, where the options do not say; 0: it goes with the level.
     :ivar levels: places on the x-axis.
     :ivar noise: (sigma_px, sigma_world in metres) of a level.
+    :ivar blind: the paper's estimator starts anywhere.
     """
 
     title: str
@@ -60,6 +62,7 @@ class Experiment:
     points: int
     levels: tuple[int, ...]
     noise: Callable[[int], tuple[float, float]]
+    blind: bool = False
 
 
 EXPERIMENTS = {
@@ -74,7 +77,7 @@ EXPERIMENTS = {
         lambda level: (0.0, 0.05)),
     'no-guess': Experiment(
         'No initial guess, at 1 px: 4 floor lines × 75 points, 5 lines in space × 20',
-        'lines', 0, 0, tuple(_BLIND_POINTS), lambda level: (1.0, 0.0)),
+        'lines', 0, 0, tuple(_BLIND_POINTS), lambda level: (1.0, 0.0), blind=True),
 }
 NAMES = (LINE_PROJECTION, *EXPERIMENTS)
 
@@ -89,7 +92,7 @@ def cells_of(name: str, options: ExperimentOptions) -> tuple[Cell, ...]:
             sigma_px, sigma_world = experiment.noise(level)
             cells.append(Cell(
                 mirror, float(level), lines, points, sigma_px, sigma_world,
-                on_floor=name == 'no-guess' and level == 4, blind=name == 'no-guess',
+                on_floor=experiment.blind and level == _BLIND_ON_FLOOR, blind=experiment.blind,
                 key=(list(EXPERIMENTS).index(name), m, level)))
     return tuple(cells)
 
@@ -158,8 +161,8 @@ def steps_of(name: str, options: ExperimentOptions) -> int:
 def _run_cells(
     cells: tuple[Cell, ...], trials: int, workers: int, backend: str, options: ExperimentOptions,
     progress: Callable[[str], None],
-) -> list[tuple[Cell, list[tuple[Answer, ...]]]]:
-    results = []
+) -> Results:
+    results: Results = []
     try:
         parallel = Parallel(n_jobs=workers, backend=backend)
     except ValueError as error:

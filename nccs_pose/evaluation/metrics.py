@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nccs_pose.evaluation.trajectory import Trajectory
-from nccs_pose.geometry.pose import Array, wrap_angle
+from nccs_pose.geometry.pose import Array, pose_differences, wrap_angle
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
@@ -143,9 +143,7 @@ def interpolate(
     until = (ordered.stamps_ns[high] - stamps) * 1e-9
     share = np.where(inside, since / np.where(gap > 0.0, gap, 1.0), 0.0)
     start, end = ordered.poses[low], ordered.poses[high]
-    step = end - start
-    step[:, 2] = wrap_angle(step[:, 2])
-    poses = start + share[:, None] * step
+    poses = start + share[:, None] * pose_differences(end, start)
     nearest = np.where(np.abs(since)[:, None] < np.abs(until)[:, None], start, end)
     as_is = (until == 0.0) | ~(inside & (gap <= max_gap))
     poses = np.where(as_is[:, None], nearest, poses)
@@ -161,9 +159,9 @@ def compare(
     poses, known = interpolate(
         truth, estimated.stamps_ns, max_gap=max_gap, tolerance=tolerance)
     index = np.flatnonzero(known)
-    error = estimated.poses[index] - poses[index]
-    error[:, 2] = wrap_angle(error[:, 2])
-    return PoseErrors(index, estimated.stamps_ns[index], error)
+    return PoseErrors(
+        index, estimated.stamps_ns[index],
+        pose_differences(estimated.poses[index], poses[index]))
 
 
 def summarise(errors: PoseErrors, *, frames: int, answered: int) -> Summary:

@@ -116,9 +116,9 @@ def _words(estimate: Estimate, truth: Pose2 | None) -> list[str]:
                     f'{math.degrees(yaw):.4f} deg')
         words.append(row)
         if truth is not None:
-            distance = 1e3 * math.hypot(pose.x - truth.x, pose.y - truth.y)
-            turn = math.degrees(abs(Pose2(yaw=pose.yaw - truth.yaw).yaw))
-            measured.append(f'error {distance:.2f} mm, {turn:.4f} deg')
+            x, y, yaw = pose.minus(truth).tolist()
+            measured.append(
+                f'error {1e3 * math.hypot(x, y):.2f} mm, {math.degrees(abs(yaw)):.4f} deg')
     # What was not measured is left out.
     if quality.points_used:
         measured += [f'{quality.lines_used} lines', f'{quality.points_used} points']

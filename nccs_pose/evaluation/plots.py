@@ -39,11 +39,23 @@ _LINE_COLOURS = {'green': '#2e9e44', 'white': '#b0b0b0', 'yellow': '#d4b400', 'r
                  'blue': '#3a6fd8'}
 
 
+def new_figure(width: float, height: float, dpi: int = 130) -> Figure:
+    """Make an empty figure.
+
+    :param width: inches.
+    :param height: inches.
+    :param dpi: pixels to an inch of the saved picture.
+    """
+    figure = Figure(figsize=(width, height), dpi=dpi, layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def trajectory_figure(
     estimated: Trajectory, truth: Trajectory | None, lines: Iterable[Line], title: str = '',
 ) -> Figure:
     """Draw the estimated poses over the true path, among the lines (a map is one)."""
-    figure = _figure(7.5, 7.0)
+    figure = new_figure(7.5, 7.0)
     axes = figure.add_subplot()
     for line in lines:
         (x0, y0), (x1, y1) = line.start[:2], line.end[:2]
@@ -79,7 +91,7 @@ def error_figure(
 
     :param covariance: (N, 3, 3), row by row with `errors`.
     """
-    figure = _figure(9.0, 6.5)
+    figure = new_figure(9.0, 6.5)
     time = (errors.stamps_ns - errors.stamps_ns[0]) * 1e-9 if len(errors) else np.zeros(0)
     panels = figure.subplots(3, 1, sharex=True)
     for k, (axes, name, unit, factor) in enumerate(zip(
@@ -105,7 +117,7 @@ def error_figure(
 
 def histogram_figure(errors: PoseErrors, title: str = '') -> Figure:
     """Draw how often each size of error occurred, with median and RMSE marked."""
-    figure = _figure(9.0, 3.8)
+    figure = new_figure(9.0, 3.8)
     for axes, values, name in zip(
         figure.subplots(1, 2), (1e3 * errors.translation, np.degrees(errors.yaw)),
         ('translation error (mm)', 'yaw error (deg)'),
@@ -124,12 +136,6 @@ def histogram_figure(errors: PoseErrors, title: str = '') -> Figure:
         axes.grid(color='#e4e4e4', linewidth=0.6)
         axes.set_axisbelow(True)
     figure.suptitle(title)
-    return figure
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=130, layout='constrained')
-    FigureCanvasAgg(figure)
     return figure
 
 

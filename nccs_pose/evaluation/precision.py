@@ -167,7 +167,7 @@ def blob_pixels(
     below, _ = scene.rig.back_project(pixels + np.array([0.0, _OUTSIDE])).floor_points()
     chosen, labels = [], []
     for k, line in enumerate(scene.line_map):
-        normal = np.array([-line.direction[1], line.direction[0]])
+        normal = line.left[:2]
         turned = normal @ pose.rotation[:2, :2]
         offset = pose.apply(floor) - line.start[:2]
         footprint = np.hypot((aside - floor) @ turned, (below - floor) @ turned)

@@ -40,6 +40,7 @@ from nccs_pose.simulation.drive import measure_odometry, WheelModel
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene
+from nccs_pose.vision.segment import hsv_mask
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,7 +50,6 @@ STAGES = tuple(field.name for field in fields(StageTimes))
 LEAST_FRAMES = 4
 _RATE = 10.0
 _SEED = 4
-_GREEN = ((40, 50, 40), (90, 255, 255))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class StageCosts:
 
 def threshold_pass(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """One full-frame HSV threshold: the unit of cost."""
-    return cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), *_GREEN)
+    return hsv_mask(image, 'green')
 
 
 @contextmanager

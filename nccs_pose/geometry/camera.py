@@ -25,6 +25,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8}
+# Newton's method that inverts the distortion, in units of the image plane (focal lengths).
+_MOST_STEPS = 20
+# Far outside the calibrated field the model folds over; short steps keep the iterate finite.
+_LONGEST_STEP = 0.5
+_LAST_STEP = 1e-14
+# A point is an inverse if it is distorted to within this of what was asked for.
+_INVERTED = 1e-10
+# Where the model's derivative has a smaller determinant it folds over.
+_LEAST_DETERMINANT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -182,23 +191,28 @@ class PinholeCamera:
         :returns: plane points (N, 2), derivative of the inverse (N, 2, 2), converged (N,).
         """
         plane = distorted.copy()
-        for _ in range(20):
-            error, inverse, regular = self._newton_step(plane, distorted)
+        for _ in range(_MOST_STEPS):
+            error, inverse, _ = self._inversion_error(plane, distorted)
             step = np.einsum('nij,nj->ni', inverse, error)
-            # Far outside the calibrated field the model folds over; keep the iterate finite.
-            plane -= np.clip(step, -0.5, 0.5)
-            if np.abs(step).max(initial=0.0) < 1e-14:
+            plane -= np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+            if np.abs(step).max(initial=0.0) < _LAST_STEP:
                 break
-        error, inverse, regular = self._newton_step(plane, distorted)
-        return plane, inverse, regular & (np.abs(error).max(axis=1, initial=0.0) < 1e-10)
+        error, inverse, regular = self._inversion_error(plane, distorted)
+        return plane, inverse, regular & (np.abs(error).max(axis=1, initial=0.0) < _INVERTED)
 
-    def _newton_step(
+    def _inversion_error(
         self, plane: Array, distorted: Array,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """How far off plane points (N, 2) are that should be distorted to others (N, 2).
+
+        :returns: the distorted points less those that were asked for (N, 2), the inverse of the
+            derivative (N, 2, 2), and whether the model does not fold over there (N,).
+        """
         out, jacobian = self._distort(plane)
         determinant = (jacobian[:, 0, 0] * jacobian[:, 1, 1]
                        - jacobian[:, 0, 1] * jacobian[:, 1, 0])
-        regular = (determinant > 1e-6) & (jacobian[:, 0, 0] + jacobian[:, 1, 1] > 0.0)
+        trace = jacobian[:, 0, 0] + jacobian[:, 1, 1]
+        regular = (determinant > _LEAST_DETERMINANT) & (trace > 0.0)
         adjugate = np.empty_like(jacobian)
         adjugate[:, 0, 0], adjugate[:, 1, 1] = jacobian[:, 1, 1], jacobian[:, 0, 0]
         adjugate[:, 0, 1], adjugate[:, 1, 0] = -jacobian[:, 0, 1], -jacobian[:, 1, 0]

@@ -38,6 +38,11 @@ from numpy.typing import NDArray
 _CELLS = 112
 _KNOTS_APART = np.array([1.0, 2.0 * _CELLS + 1.0])
 _MIDDLE_KNOT = _CELLS * _KNOTS_APART.sum()
+# What is known at a knot, column by column: the terms of its expansion (see FloorExpansion); its
+# offset from the mirror's foot; its falls; and one over the height at which its ray leaves the
+# mirror, with 1 for the imaginary part where the image shows the floor.
+_TERMS = slice(0, 6)
+_OFFSET, _FALLS, _INVERSE_HEIGHT = 6, 7, 8
 # The derivatives at a knot come from the knots about it, twice; and the nearest to a point may lie
 # a little beyond it.
 _MARGIN = 3.0 / _CELLS
@@ -110,12 +115,7 @@ class FloorTable:
         self._knots = self._forward()
 
     def _forward(self) -> Complex:
-        """What is known at the knots (M, 9).
-
-        The terms there, the knot's offset from the mirror's foot, the falls, and one over the
-        height at which the ray leaves the mirror, with 1 for the imaginary part where the image
-        shows the floor.
-        """
+        """What is known at the knots (M, 9): see _TERMS and after."""
         cells = np.arange(-_CELLS, _CELLS + 1.0) / _CELLS
         place: Complex = cells + 1j * cells[:, None]
         inside = 1.0 - np.abs(place) ** 2
@@ -183,10 +183,10 @@ class FloorTable:
         """
         at = as_complex(points)
         knots, step = self._nearest(at)
-        steeper = knots[:, 8].real
+        inverse_height = knots[:, _INVERSE_HEIGHT].real
         # The ray meets the floor a little further on, but comes from the same place.
-        share = rise / np.maximum(1.0 - rise * steeper, 0.5)
-        return as_points(at + share * (knots[:, 7] + steeper * step))
+        share = rise / np.maximum(1.0 - rise * inverse_height, 0.5)
+        return as_points(at + share * (knots[:, _FALLS] + inverse_height * step))
 
     def pixels(self, points: Array) -> Array:
         """Pixels (N, 2) of ground points (N, 2) in base_link, whether or not in the image."""
@@ -199,13 +199,13 @@ class FloorTable:
         """
         nearest, step = self._nearest(points)
         knots = np.ascontiguousarray(nearest.T)
-        terms, pixels, back = knots[:6], knots[0], step.conj()
+        terms, pixels, back = knots[_TERMS], knots[0], step.conj()
         # Half of what the step adds to the first derivatives; the pixel goes by their mean.
         slopes, added = terms[1:3], 0.5 * (terms[3:5] * step + terms[4:6] * back)
         slopes += added
         pixels += slopes[0] * step + slopes[1] * back
         slopes += added
-        return FloorExpansion(terms, knots[7] + knots[8].real * step)
+        return FloorExpansion(terms, knots[_FALLS] + knots[_INVERSE_HEIGHT].real * step)
 
     def outline(self, points: Complex) -> tuple[Complex, NDArray[np.bool_]]:
         """About where ground points x + iy (N,) in base_link are seen, and whether they are.
@@ -215,7 +215,7 @@ class FloorTable:
         """
         knots, step = self._nearest(points)
         pixels = knots[:, 0] + knots[:, 1] * step + knots[:, 2] * step.conj()
-        return pixels, np.asarray(knots[:, 8].imag > 0.0)
+        return pixels, np.asarray(knots[:, _INVERSE_HEIGHT].imag > 0.0)
 
     def _nearest(self, points: Complex) -> tuple[Complex, Complex]:
         """The nearest knots to points (N, 9), see :meth:`_forward`, and the way from them (N,)."""
@@ -224,7 +224,7 @@ class FloorTable:
         place = as_points(offset * (_CELLS / self._stretch(square)))
         at = np.rint(place).dot(_KNOTS_APART) + _MIDDLE_KNOT
         knots = self._knots.take(at.astype(np.intp), axis=0, mode='clip')
-        return knots, offset - knots[:, 6]
+        return knots, offset - knots[:, _OFFSET]
 
     def _stretch(self, square: Array) -> Array:
         """How many metres of the floor one of the stereographic plane is.

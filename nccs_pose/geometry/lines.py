@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array, Pose2, RigidTransform
+from nccs_pose.geometry.pose import Array, checked_vector, Pose2, RigidTransform
 import numpy as np
 
 
@@ -46,10 +46,7 @@ class Line:
 
     def __post_init__(self) -> None:
         for key in ('start', 'end'):
-            point = np.array(getattr(self, key), dtype=float)
-            if point.shape != (3,) or not np.isfinite(point).all():
-                raise GeometryError(
-                    f'line {self.name!r}: {key} {point.tolist()} is not three finite numbers')
+            point = checked_vector(f'line {self.name!r}: {key}', getattr(self, key))
             # What follows from the ends is kept.
             point.setflags(write=False)
             object.__setattr__(self, key, point)
@@ -73,6 +70,11 @@ class Line:
         return (self.end - self.start) / self.length
 
     @cached_property
+    def left(self) -> Array:
+        """Horizontal vector (3,) to the left of the direction; unit if the line is horizontal."""
+        return np.array([-self.direction[1], self.direction[0], 0.0])
+
+    @cached_property
     def moment(self) -> Array:
         """Plücker moment mu = q x d (3,), metres."""
         return np.cross(self.start, self.direction)
@@ -89,8 +91,8 @@ class Line:
 
     def edges(self) -> tuple[Line, Line]:
         """The right and the left edge of the tape, each a line of no width."""
-        left = np.array([-self.direction[1], self.direction[0], 0.0])
-        return (self._shifted(-0.5 * self.width * left), self._shifted(0.5 * self.width * left))
+        half = 0.5 * self.width * self.left
+        return self._shifted(-half), self._shifted(half)
 
     def _shifted(self, offset: Array) -> Line:
         return replace(self, start=self.start + offset, end=self.end + offset, width=0.0)
@@ -142,6 +144,11 @@ class LineMap:
     def directions(self) -> Array:
         """Unit directions (L, 3)."""
         return np.array([line.direction for line in self.lines])
+
+    @cached_property
+    def lefts(self) -> Array:
+        """Vectors to the left of the directions (L, 3)."""
+        return np.array([line.left for line in self.lines])
 
     @cached_property
     def moments(self) -> Array:

@@ -21,11 +21,11 @@ from functools import cached_property
 import math
 
 from nccs_pose.errors import GeometryError
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, checked_vector
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-_CONE_TOLERANCE = 1e-12
+_CONE_TOLERANCE = 1e-12  # square metres, of the squared radius: a cone's is zero but for rounding
 
 
 @dataclass(frozen=True)
@@ -54,30 +54,39 @@ class QuadricMirror:
         if self.A == 0.0 and self.B <= 0.0:
             raise GeometryError(
                 f'mirror: A = 0 with B = {self.B} is no paraboloid convex towards +z (B > 0)')
-        if self.A > 0.0 and self._depth <= 0.0:
+        if self.A > 0.0 and self.squared_radius <= 0.0:
             raise GeometryError(
                 f'mirror: A = {self.A}, B = {self.B}, C = {self.C} has no real surface')
-        if self.A < 0.0 and self._depth > _CONE_TOLERANCE:
+        if self.A < 0.0 and self.squared_radius > _CONE_TOLERANCE:
             raise GeometryError(
                 f'mirror: A = {self.A}, B = {self.B}, C = {self.C} is a hyperboloid of one '
                 'sheet, which has no apex to look at')
         rim = self.rim_radius
         if rim is not None and not (math.isfinite(rim) and rim > 0.0):
             raise GeometryError(f'mirror: rim_radius = {rim} is not a positive length')
-        if rim is not None and self.A > 0.0 and rim**2 > self._depth * (1.0 + 1e-9):
+        if rim is not None and self.A > 0.0 and rim**2 > self.squared_radius * (1.0 + 1e-9):
             raise GeometryError(
                 f'mirror: rim_radius = {rim} exceeds the largest radius '
                 f'{self.largest_radius:.6g} of the surface')
 
     @property
-    def _depth(self) -> float:
-        """C + B^2 / (4 A): the right side of Omega once it is centred; C for a paraboloid."""
+    def centre_z(self) -> float:
+        """The z of the surface's centre, -B / (2 A); a paraboloid has none."""
+        return -self.B / (2.0 * self.A)
+
+    @property
+    def squared_radius(self) -> float:
+        """C + B^2 / (4 A), the right side of x^2 + y^2 + A (z - centre)^2 = ..., square metres.
+
+        At the equator of a sphere or spheroid it is the radius squared; 0 for a cone, negative for
+        a hyperboloid of two sheets; C for a paraboloid.
+        """
         return self.C + self.B**2 / (4.0 * self.A) if self.A != 0.0 else self.C
 
     @property
     def largest_radius(self) -> float:
         """The surface's radius at its equator; infinite where it has none."""
-        return math.sqrt(self._depth) if self.A > 0.0 else math.inf
+        return math.sqrt(self.squared_radius) if self.A > 0.0 else math.inf
 
     @property
     def kind(self) -> str:
@@ -86,14 +95,14 @@ class QuadricMirror:
             return 'paraboloid'
         if self.A > 0.0:
             return 'sphere' if self.A == 1.0 else 'spheroid'
-        return 'cone' if abs(self._depth) <= _CONE_TOLERANCE else 'hyperboloid'
+        return 'cone' if abs(self.squared_radius) <= _CONE_TOLERANCE else 'hyperboloid'
 
     def _height_at(self, radius_squared: float) -> float:
         """The z of the physical sheet at a distance from the axis."""
         if self.A == 0.0:
             return (self.C - radius_squared) / self.B
-        root = math.sqrt(max(0.0, (self._depth - radius_squared) / self.A))
-        return -self.B / (2.0 * self.A) + math.copysign(root, self.A)
+        root = math.sqrt(max(0.0, (self.squared_radius - radius_squared) / self.A))
+        return self.centre_z + math.copysign(root, self.A)
 
     @cached_property
     def apex_z(self) -> float:
@@ -105,7 +114,7 @@ class QuadricMirror:
         """The z of the rim; of the equator or minus infinity where there is none."""
         if self.rim_radius is not None:
             return self._height_at(self.rim_radius**2)
-        return -self.B / (2.0 * self.A) if self.A > 0.0 else -math.inf
+        return self.centre_z if self.A > 0.0 else -math.inf
 
     def level(self, points: Array) -> Array:
         """Omega at points (..., 3), square metres; negative inside a sphere."""
@@ -121,6 +130,19 @@ class QuadricMirror:
         points[..., 2] = self.A * points[..., 2] + 0.5 * self.B
         return points
 
+    def reflected(self, incident: Array, points: Array) -> Array:
+        """Unit reflected rays v - 2 n (v.n)/(n.n) (the paper's eq. 9), (N, 3).
+
+        :param incident: v (N, 3), of any length.
+        :param points: where they meet the mirror (N, 3); rows that are no such points give
+            finite rays without a meaning.
+        """
+        n = self.normal(points)
+        square = np.einsum('ni,ni->n', n, n)
+        along = np.einsum('ni,ni->n', incident, n) / np.where(square > 0.0, square, 1.0)
+        rays = incident - 2.0 * along[:, None] * n
+        return rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Whether surface points (..., 3) lie on the physical part."""
         z = np.asarray(points, dtype=float)[..., 2]
@@ -131,6 +153,20 @@ class QuadricMirror:
         """Whether a point (3,) lies inside the mirror's body."""
         below = self.A >= 0.0 or self.A * float(point[2]) + 0.5 * self.B > 0.0
         return bool(self.level(point) <= 0.0) and below
+
+    def checked_cop(self, cop: ArrayLike) -> Array:
+        """Return a centre of projection (3,) that a camera before this mirror can have, a copy.
+
+        :raises GeometryError: if it is not three finite numbers, off the plane x = 0, or inside
+            the mirror.
+        """
+        cop = checked_vector('cop', cop)
+        if cop[0] != 0.0:
+            raise GeometryError(
+                f'cop {cop.tolist()}: its x must be 0 (turn the mirror frame about its axis)')
+        if self.encloses(cop):
+            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
+        return cop
 
     def intersect(self, origin: Array, directions: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Where rays from one origin first meet the mirror from outside.

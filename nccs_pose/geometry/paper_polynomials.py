@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.mirror import QuadricMirror
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.pose import Array, checked_vector
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -158,15 +158,10 @@ def paper_polynomials(
     :raises GeometryError: if d is zero, anything is not finite, or o is off the plane x = 0 or
         inside the mirror.
     """
-    o, q, d = (np.asarray(v, dtype=float) for v in (cop, q, d))
-    if not all(np.isfinite(v).all() and v.shape == (3,) for v in (o, q, d)):
-        raise GeometryError(f'cop {o}, q {q} and d {d} must be three finite numbers each')
+    o = mirror.checked_cop(cop)
+    q, d = checked_vector('q', q), checked_vector('d', d)
     if not d.any():
         raise GeometryError('the line has the direction d = 0')
-    if o[0] != 0.0:
-        raise GeometryError(f'cop {o.tolist()}: its x must be 0')
-    if mirror.encloses(o):
-        raise GeometryError(f'cop {o.tolist()} lies inside the mirror')
     base = mirror_polynomials(mirror, o)
     y, z, one = _poly((1, 0, 1.0)), _poly((0, 1, 1.0)), _poly((0, 0, 1.0))
 

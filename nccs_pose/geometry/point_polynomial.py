@@ -166,11 +166,27 @@ def _value(polynomial: Polynomial, z: Array) -> Array:
     return total
 
 
+def companion_roots(coefficients: Array) -> NDArray[np.complex128]:
+    """All roots (N, degree) of monic polynomials z^degree + c_1 z^(degree - 1) + ...
+
+    Eigenvalues of the companion matrices, batched.
+
+    :param coefficients: c_1, c_2, ... (N, degree).
+    """
+    count, degree = coefficients.shape
+    companion = np.zeros((count, degree, degree))
+    companion[:, 0] = -coefficients
+    companion[:, np.arange(1, degree), np.arange(degree - 1)] = 1.0
+    return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
+
+
 def real_roots(coefficients: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
     """Real parts of all roots (N, degree), and which are real to the tolerance times 1 + |z|.
 
-    Eigenvalues of the companion matrices, batched. Leading coefficients that vanish for every
-    point (the sphere's, the paraboloid's) lower the degree.
+    Leading coefficients that vanish for every point (the sphere's, the paraboloid's) lower the
+    degree.
+
+    :param coefficients: of each polynomial by falling power (N, degree + 1).
     """
     size = np.abs(coefficients).max(axis=1, keepdims=True)
     scaled = coefficients / np.where(size > 0.0, size, 1.0)
@@ -178,12 +194,8 @@ def real_roots(coefficients: Array, tolerance: float) -> tuple[Array, NDArray[np
     if not significant.any():
         return np.zeros((len(scaled), 0)), np.zeros((len(scaled), 0), dtype=bool)
     scaled = scaled[:, int(np.argmax(significant)) :]
-    degree = scaled.shape[1] - 1
     # a point whose own leading coefficient vanishes has its last root at infinity
     leading = np.where(np.abs(scaled[:, 0]) > 1e-300, scaled[:, 0], 1e-300)
-    companion = np.zeros((len(scaled), degree, degree))
-    companion[:, 0, :] = np.clip(-scaled[:, 1:] / leading[:, None], -1e150, 1e150)
-    companion[:, np.arange(1, degree), np.arange(degree - 1)] = 1.0
-    roots = np.linalg.eigvals(companion)
+    roots = companion_roots(np.clip(scaled[:, 1:] / leading[:, None], -1e150, 1e150))
     real = np.abs(roots.imag) <= tolerance * (1.0 + np.abs(roots.real))
     return roots.real, real

@@ -38,6 +38,13 @@ def wrapped(angle: float) -> float:
     return -((-angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
+def pose_differences(poses: Array, others: Array) -> Array:
+    """Poses (..., 3) of x, y, yaw less others (..., 3), the difference of angles wrapped."""
+    difference: Array = poses - others
+    difference[..., 2] = wrap_angle(difference[..., 2])
+    return difference
+
+
 @dataclass(frozen=True)
 class Pose2:
     """A planar pose, the rigid motion (x, y, yaw): ``p_a = T_a_b.apply(p_b)``.
@@ -124,12 +131,8 @@ class RigidTransform:
     translation: Array
 
     def __post_init__(self) -> None:
-        rotation = np.array(self.rotation, dtype=float)
-        translation = np.array(self.translation, dtype=float)
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise GeometryError(f'translation {translation.tolist()} is not three finite numbers')
-        object.__setattr__(self, 'rotation', checked_rotation(rotation))
-        object.__setattr__(self, 'translation', translation)
+        object.__setattr__(self, 'translation', checked_vector('translation', self.translation))
+        object.__setattr__(self, 'rotation', checked_rotation(self.rotation))
 
     @classmethod
     def from_rpy(cls, rpy: ArrayLike, translation: ArrayLike) -> RigidTransform:
@@ -164,6 +167,18 @@ class RigidTransform:
     def rotate(self, vectors: ArrayLike) -> Array:
         """Map directions (..., 3) from frame b to frame a."""
         return np.asarray(vectors, dtype=float) @ self.rotation.T
+
+
+def checked_vector(name: str, value: ArrayLike) -> Array:
+    """Return a vector (3,), a copy.
+
+    :param name: what it is, for the message.
+    :raises GeometryError: if it is not three finite numbers.
+    """
+    vector = np.array(value, dtype=float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise GeometryError(f'{name} {vector.tolist()} is not three finite numbers')
+    return vector
 
 
 def checked_rotation(rotation: ArrayLike) -> Array:

@@ -34,10 +34,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _CHUNK = 2048  # points at a time: the working arrays stay in the processor's cache
-_NEWTON_STEPS = 7
-_POLISH_STEPS = 25
+_NEWTON_STEPS = 7  # what has no certificate by then goes to the polynomial
+_POLISH_STEPS = 25  # from its roots, which may be far off where two of them meet
+_SETTLED = 1e-10  # length of the last step, in distances of the camera from the apex
+_LONGEST_STEP = 0.5  # likewise
 _REAL_ROOT = 1e-3  # generous: double roots split by rounding; the certificate decides
-_RIM_MARGIN = 1.0 - 1e-9
+_EQUATOR_MARGIN = 1.0 - 1e-9  # of r^2: at the equator of a spheroid h is zero
+_INSIDE_EQUATOR = 0.98  # of the largest r^2: where a step ends that would go beyond
+_STEEPEST_GUESS = 4.0  # tan of a normal's tilt, 76 degrees: no first guess lies nearer the equator
+_OF_THE_CONE = 0.9  # of the tilt that a hyperboloid's normals come near to, far down its sides
 
 
 def reflect_points(
@@ -54,12 +59,8 @@ def reflect_points(
     :raises GeometryError: if the centre of projection or a point is not finite or of the wrong
         shape, or if the centre of projection is off the plane x = 0 or inside the mirror.
     """
-    cop = np.asarray(cop, dtype=np.float64)
+    cop = mirror.checked_cop(cop)
     points = np.asarray(points, dtype=np.float64)
-    if cop.shape != (3,) or not np.isfinite(cop).all():
-        raise GeometryError(f'cop must be 3 finite numbers, got {cop.tolist()}')
-    if cop[0] != 0.0:
-        raise GeometryError(f'cop must lie in the plane x = 0 of the mirror frame, x = {cop[0]}')
     if points.ndim != 2 or points.shape[1] != 3:
         raise GeometryError(f'points must have the shape (N, 3), got {points.shape}')
     if not np.isfinite(points).all():
@@ -83,8 +84,6 @@ class _Scene:
 
     def __init__(self, mirror: QuadricMirror, cop: Array) -> None:
         self.apex = np.array([0.0, 0.0, mirror.apex_z])
-        if mirror.encloses(cop):
-            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
         self.mirror = mirror
         self.unit = float(np.linalg.norm(cop - self.apex))
         self.a = float(mirror.A)
@@ -92,7 +91,7 @@ class _Scene:
         self.cop = (cop - self.apex) / self.unit
         # h must stay positive: on a spheroid the graph ends at its equator
         limit = self.b**2 / (4 * self.a) if self.a > 0.0 else np.inf
-        self.r2_limit = _RIM_MARGIN * limit
+        self.r2_limit = _EQUATOR_MARGIN * limit
 
     def _height(self, r2: Array) -> tuple[Array, Array]:
         """Heights z and h of the sheet over x^2 + y^2 = r2."""
@@ -138,7 +137,7 @@ class _Scene:
             e = _unit(self.cop - m) + _unit(p - m)
             # tan of the normal's tilt; a hyperboloid has no point with more than its cone's tilt
             lean = np.hypot(e[:, 0], e[:, 1])
-            steepest = 0.9 / np.sqrt(-self.a) if self.a < 0.0 else 4.0
+            steepest = _OF_THE_CONE / np.sqrt(-self.a) if self.a < 0.0 else _STEEPEST_GUESS
             tilt = np.minimum(lean / np.maximum(e[:, 2], 1e-3), steepest)
             # (x, y) = tau tilt, h = tau, and h^2 = B^2 / 4 - A r^2
             r = tilt * self.b / 2 / np.sqrt(1.0 + self.a * tilt**2)
@@ -183,17 +182,17 @@ class _Scene:
                     break
                 x, y = self._step(x, y, d_x, d_y)
             front = (a_x * u + a_y * v + a_z > 0.0) & (b_x * u + b_y * v + b_z > 0.0)
-            settled = np.abs(d_x) + np.abs(d_y) <= 1e-10
+            settled = np.abs(d_x) + np.abs(d_y) <= _SETTLED
             return x, y, settled & front & (determinant > 0.0)
 
     def _step(
         self, x: Array, y: Array, d_x: Array, d_y: Array
     ) -> tuple[Array, Array]:
-        """A step of at most half the camera's distance, kept on the sheet."""
-        short = np.minimum(1.0, 0.5 / (np.abs(d_x) + np.abs(d_y)))
+        """A step of no more than the longest, kept on the sheet."""
+        short = np.minimum(1.0, _LONGEST_STEP / (np.abs(d_x) + np.abs(d_y)))
         x, y = x + short * d_x, y + short * d_y
         if np.isfinite(self.r2_limit):
-            back = np.minimum(1.0, np.sqrt(0.98 * self.r2_limit / (x * x + y * y)))
+            back = np.minimum(1.0, np.sqrt(_INSIDE_EQUATOR * self.r2_limit / (x * x + y * y)))
             x, y = x * back, y * back
         return x, y
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The reflection curve of a line in closed form, its branches, and its trace in the image.
+"""The reflection curve of a line in closed form, and the branches of gamma's zeros.
 
 With the mirror polynomials E, N, L, W, v_y, v_z (:mod:`nccs_pose.geometry.paper_polynomials`), the
 line q + lambda d and its moment mu = q x d,
@@ -39,13 +39,19 @@ from nccs_pose.errors import GeometryError
 from nccs_pose.geometry.lines import Line
 from nccs_pose.geometry.mirror import QuadricMirror
 from nccs_pose.geometry.paper_polynomials import mirror_polynomials, MirrorPolynomials
-from nccs_pose.geometry.pose import Array
+from nccs_pose.geometry.point_polynomial import companion_roots
+from nccs_pose.geometry.pose import Array, checked_vector
 from nccs_pose.geometry.rig import Rig
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# A root is real if its imaginary part is no larger than rounding leaves it where two roots meet;
+# in units of the mirror's half width.
 _REAL_ROOT = 1e-6
+# Below this a sine, or the slope of E by y, is rounding: ray and line are parallel, E is constant.
 _FLAT = 1e-12
+# Below this share of the largest a leading coefficient is rounding: its root lies at infinity.
+_NO_LEADING = 1e-14
 # A point is on a branch if it is no further off, metres: between ray and line for S, on the mirror
 # for E.
 _ON_BRANCH = 1e-6
@@ -84,19 +90,13 @@ class ReflectionCurve:
     direction: Array
 
     def __post_init__(self) -> None:
-        for key in ('cop', 'point', 'direction'):
-            value = np.array(getattr(self, key), dtype=float)
-            if value.shape != (3,) or not np.isfinite(value).all():
-                raise GeometryError(f'{key} {value.tolist()} is not three finite numbers')
-            object.__setattr__(self, key, value)
-        length = np.linalg.norm(self.direction)
+        object.__setattr__(self, 'cop', self.mirror.checked_cop(self.cop))
+        object.__setattr__(self, 'point', checked_vector('point', self.point))
+        direction = checked_vector('direction', self.direction)
+        length = np.linalg.norm(direction)
         if length == 0.0:
             raise GeometryError('the line has the direction d = 0')
-        if self.cop[0] != 0.0:
-            raise GeometryError(f'cop {self.cop.tolist()}: its x must be 0')
-        if self.mirror.encloses(self.cop):
-            raise GeometryError(f'cop {self.cop.tolist()} lies inside the mirror')
-        object.__setattr__(self, 'direction', self.direction / length)
+        object.__setattr__(self, 'direction', direction / length)
 
     @classmethod
     def of_line(cls, rig: Rig, line: Line) -> ReflectionCurve:
@@ -145,11 +145,7 @@ class ReflectionCurve:
 
     def rays(self, points: Array) -> Array:
         """Unit reflected rays (N, 3) at mirror points (N, 3)."""
-        n = self.mirror.normal(points)
-        v = points - self.cop
-        along = np.einsum('ni,ni->n', v, n) / np.einsum('ni,ni->n', n, n)
-        v = v - 2.0 * along[:, None] * n
-        return v / np.linalg.norm(v, axis=1, keepdims=True)
+        return self.mirror.reflected(points - self.cop, points)
 
     def along_line(self, points: Array) -> tuple[Array, Array]:
         """Where reflected rays pass the line, for mirror points (N, 3).
@@ -217,7 +213,8 @@ class ReflectionCurve:
         w = np.minimum(self.factors(y, z)[3], 0.0)
         right = np.stack([np.sqrt(-w), y, z], axis=1)
         points = np.concatenate([right, right * [-1.0, 1.0, 1.0]])
-        near = np.concatenate([self._is_nearer(right), ~self._is_nearer(right)])
+        near = self._is_nearer(right)
+        near = np.concatenate([near, ~near])
         _, ahead = self.along_line(points)
         branch = np.where(near, np.where(ahead > 0.0, Branch.PHYSICAL, Branch.VIRTUAL),
                           Branch.MIRRORED)
@@ -240,12 +237,10 @@ class ReflectionCurve:
         quartic = samples @ np.linalg.inv(np.vander(nodes, 5)).T
         size = np.abs(quartic).max(axis=1, initial=0.0)
         regular = size > 0.0
-        leading = np.where(regular & (np.abs(quartic[:, 0]) > 1e-14 * size), quartic[:, 0],
-                           np.where(regular, 1e-14 * size, 1.0))
-        companion = np.zeros((len(z), 4, 4))
-        companion[:, 0] = -quartic[:, 1:] / leading[:, None]
-        companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
-        roots = np.linalg.eigvals(companion)
+        leading = np.where(
+            regular & (np.abs(quartic[:, 0]) > _NO_LEADING * size), quartic[:, 0],
+            np.where(regular, _NO_LEADING * size, 1.0))
+        roots = companion_roots(quartic[:, 1:] / leading[:, None])
         real = (np.abs(roots.imag) < _REAL_ROOT) & (np.abs(roots.real) <= 1.0)
         which, column = np.nonzero(real & regular[:, None])
         return which, roots.real[which, column] * reach[which]

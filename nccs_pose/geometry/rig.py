@@ -87,14 +87,7 @@ class Rig:
     T_base_mirror: RigidTransform
 
     def __post_init__(self) -> None:
-        cop = np.array(self.cop, dtype=float)
-        if cop.shape != (3,) or not np.isfinite(cop).all():
-            raise GeometryError(f'cop {cop.tolist()} is not three finite numbers')
-        if cop[0] != 0.0:
-            raise GeometryError(
-                f'cop {cop.tolist()}: its x must be 0 (turn the mirror frame about its axis)')
-        if self.mirror.encloses(cop):
-            raise GeometryError(f'cop {cop.tolist()} lies inside the mirror')
+        cop = self.mirror.checked_cop(self.cop)
         object.__setattr__(self, 'cop', cop)
         object.__setattr__(self, 'R_mirror_camera', checked_rotation(self.R_mirror_camera))
         camera = self.camera

@@ -12,7 +12,6 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-
 """Small symmetric matrices, without numpy's ceremony.
 
 Two and three rows go number by number, quicker than any call; more of them to LAPACK itself.
@@ -59,8 +58,8 @@ def solve_3x3(
     return bx - ax * z, by - ay * z, z
 
 
-def solved(matrix: Array, right: Array) -> Array | None:
-    """The same for a matrix (3, 3) and a right side (3,)."""
+def solve_if_definite(matrix: Array, right: Array) -> Array | None:
+    """As :func:`solve_3x3`, for a matrix (3, 3) and a right side (3,)."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrix.tolist()
     found = solve_3x3(xx, xy, yy, xz, yz, zz, *right.tolist())
     return None if found is None else np.array(found)
@@ -73,7 +72,7 @@ def is_definite(matrix: Array, least: float = 0.0) -> bool:
         xx - least, xy, yy - least, xz, yz, zz - least, 0.0, 0.0, 0.0) is not None
 
 
-def definite_solutions(matrices: Array, right: Array) -> Array:
+def solve_each_definite(matrices: Array, right: Array) -> Array:
     """Solutions (H, 3) of systems (H, 3, 3) that are positive definite, far beyond rounding."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = matrices.transpose(1, 2, 0)
     gx, gy, gz = right.T
@@ -86,9 +85,9 @@ def definite_solutions(matrices: Array, right: Array) -> Array:
     return np.array([first - one * y - other * z, y, z]).T
 
 
-def solution(matrix: Array, right: Array) -> Array:
+def solve_symmetric(matrix: Array, right: Array) -> Array:
     """Solution (P,) of any regular, symmetric system (P, P)."""
-    found = solved(matrix, right) if len(right) == 3 else None
+    found = solve_if_definite(matrix, right) if len(right) == 3 else None
     return np.asarray(np.linalg.solve(matrix, right), dtype=float) if found is None else found
 
 
@@ -109,7 +108,7 @@ def inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(matrix), dtype=float) if found is None else found
 
 
-def definite_solution(matrix: Array, right: Array) -> Array:
+def solve_definite(matrix: Array, right: Array) -> Array:
     """Solution (P,) or (P, K) of a system (P, P) by Cholesky's factors.
 
     :raises numpy.linalg.LinAlgError: where the matrix is not positive definite.

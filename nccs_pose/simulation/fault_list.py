@@ -58,23 +58,14 @@ def _sensor(**gains: float) -> Callable[[Scene, Pose2], Scene]:
         blue, green, red = sensor.white_balance
         balance = (blue * gains.get('blue', 1.0), green * gains.get('green', 1.0),
                    red * gains.get('red', 1.0))
-        sensor = dataclasses.replace(
-            sensor, exposure=sensor.exposure * gains.get('exposure', 1.0), white_balance=balance)
-        return dataclasses.replace(scene, sensor=sensor)
+        return scene.with_sensor(
+            exposure=sensor.exposure * gains.get('exposure', 1.0), white_balance=balance)
 
     return change
 
 
 def _shaken(scene: Scene, _: Pose2) -> Scene:
-    sensor = dataclasses.replace(scene.sensor, exposure_time=0.08, exposure_steps=5)
-    return dataclasses.replace(scene, sensor=sensor)
-
-
-def _with(scene: Scene, obstacles: list[Obstacle], patches: tuple[Line, ...] = ()) -> Scene:
-    look = scene.appearance
-    look = dataclasses.replace(
-        look, obstacles=(*look.obstacles, *obstacles), patches=(*look.patches, *patches))
-    return dataclasses.replace(scene, appearance=look)
+    return scene.with_sensor(exposure_time=0.08, exposure_steps=5)
 
 
 def _littered(scene: Scene, _: Pose2) -> Scene:
@@ -88,7 +79,7 @@ def _littered(scene: Scene, _: Pose2) -> Scene:
                paper(1.2, -0.5, 0.2, 0.2, 0.1), paper(-1.2, 0.9, 0.7, 0.5, 0.04))
     boxes = [Obstacle(2.3, -0.6, 0.15, 0.3, _GREEN), Obstacle(-0.4, 1.8, 0.12, 0.5, _GREEN),
              Obstacle(0.6, -2.0, 0.2, 0.25, _GREEN)]
-    return _with(scene, boxes, patches)
+    return scene.with_things(boxes, patches)
 
 
 def _crowded(lines: int, scene: Scene, pose: Pose2) -> Scene:
@@ -100,25 +91,11 @@ def _crowded(lines: int, scene: Scene, pose: Pose2) -> Scene:
         for share in np.linspace(-0.05, 1.05, 2 + int(np.linalg.norm(ends[1] - ends[0]) / 0.3)):
             x, y = ends[0] + share * (ends[1] - ends[0])
             people.append(Obstacle(float(x), float(y), 0.2, 1.7, (0.25, 0.15, 0.2)))
-    return _with(scene, people)
+    return scene.with_things(people)
 
 
 def _only(*names: str) -> Callable[[Scene, Pose2], Scene]:
-    def change(scene: Scene, _: Pose2) -> Scene:
-        kept = tuple(line for line in scene.line_map if line.name in names)
-        return dataclasses.replace(scene, line_map=LineMap(kept))
-
-    return change
-
-
-def _with_parallels(scene: Scene) -> Scene:
-    """Turn the northern line until it is parallel to the southern one, exactly."""
-    south, north = scene.line_map[0], scene.line_map[2]
-    half = 0.5 * north.length * south.direction
-    middle = 0.5 * (north.start + north.end)
-    turned = dataclasses.replace(north, start=middle + half, end=middle - half)
-    lines = (south, scene.line_map[1], turned, scene.line_map[3])
-    return dataclasses.replace(scene, line_map=LineMap(lines))
+    return lambda scene, _: scene.with_tapes(*names)
 
 
 def _one_moved(line_map: LineMap) -> LineMap:
@@ -271,7 +248,7 @@ FAULTS: tuple[Fault, ...] = (
     *_occluders(),
     Fault('one_line', 'only the southern line is there', scene=_only('south')),
     Fault('parallel_lines', 'only two parallel lines are there',
-          world=_with_parallels, scene=_only('south', 'north')),
+          world=Scene.with_parallel_tapes, scene=_only('south', 'north')),
     Fault('map_line_moved', 'the map has one line 0.2 m off', lasting=True, belief=_one_moved),
     Fault('carried_2m', 'the robot is carried 2 m away', 0, drive=_carried_away),
     Fault('turned_180', 'the robot is turned by 180 degrees', 0, drive=_turned_round),

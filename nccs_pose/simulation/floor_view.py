@@ -72,15 +72,10 @@ class FloorView:
 def reflected_rays(rig: Rig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give mirror points (N, 3) and unit reflected directions (N, 3) in base_link, and hits (N,).
 
-    Straight from the law of reflection, without the derivatives of `Rig.back_project`.
+    Without the derivatives of `Rig.back_project`.
     """
     points, hit = rig.mirror_points(pixels)
-    incident = points - rig.cop
-    normal = rig.mirror.normal(points)
-    squared = np.where(hit, np.einsum('ni,ni->n', normal, normal), 1.0)
-    along = np.einsum('ni,ni->n', incident, normal) / squared
-    reflected = incident - 2.0 * along[:, None] * normal
-    reflected /= np.maximum(np.linalg.norm(reflected, axis=1), 1e-12)[:, None]
+    reflected = rig.mirror.reflected(points - rig.cop, points)
     return rig.T_base_mirror.apply(points), rig.T_base_mirror.rotate(reflected), hit
 
 

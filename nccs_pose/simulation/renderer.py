@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from nccs_pose.geometry.pose import Pose2
 from nccs_pose.simulation.bodies import body_overlay, paint_obstacle
-from nccs_pose.simulation.coverage import tape_coverage
 from nccs_pose.simulation.floor_view import floor_view, FloorView
 from nccs_pose.simulation.motion import integrate_twist, Twist
 from nccs_pose.simulation.scene import Appearance, Room, Scene
 from nccs_pose.simulation.sensors import expose, irradiate, respond
+from nccs_pose.simulation.tape_coverage import tape_coverage
 from nccs_pose.simulation.textures import (
     ceiling_colours,
     floor_brightness,
@@ -83,8 +83,8 @@ def paint(scene: Scene, pose: Pose2) -> np.ndarray:
         paint_obstacle(colours, view, obstacle, pose)
     if look.body is not None:
         cop = scene.rig.T_base_mirror.apply(scene.rig.cop)
-        index, paint_ = body_overlay(view, look.body, tuple(cop.tolist()))
-        colours[index] = paint_
+        index, own_colours = body_overlay(view, look.body, tuple(cop.tolist()))
+        colours[index] = own_colours
     image = np.empty((view.height * view.width, 3), np.float32)
     image[:] = look.surround
     image[view.pixel] = colours

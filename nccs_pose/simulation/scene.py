@@ -21,8 +21,10 @@ reflectances from 0 to 1, proportional to light; what the camera makes of them i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import dataclasses
 import math
+from typing import Any
 
 from nccs_pose.errors import SimulationError
 from nccs_pose.geometry.camera import PinholeCamera
@@ -153,11 +155,6 @@ class Scene:
     appearance: Appearance = dataclasses.field(default_factory=Appearance)
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
 
-    def mounted(self, T_base_mirror: RigidTransform) -> Scene:
-        """The same with the mirror mounted otherwise on the robot."""
-        return dataclasses.replace(
-            self, rig=dataclasses.replace(self.rig, T_base_mirror=T_base_mirror))
-
     def __post_init__(self) -> None:
         for line in (*self.line_map, *self.appearance.patches):
             if abs(line.start[2]) > 1e-9 or abs(line.end[2]) > 1e-9:
@@ -170,6 +167,37 @@ class Scene:
                 raise SimulationError(
                     f'line {line.name!r}: no paint of colour {line.colour!r}; there is {known}'
                 )
+
+    def mounted(self, T_base_mirror: RigidTransform) -> Scene:
+        """The same with the mirror mounted otherwise on the robot."""
+        return dataclasses.replace(
+            self, rig=dataclasses.replace(self.rig, T_base_mirror=T_base_mirror))
+
+    def with_sensor(self, **changes: Any) -> Scene:
+        """The same with some fields of the camera's sensor changed."""
+        return dataclasses.replace(self, sensor=dataclasses.replace(self.sensor, **changes))
+
+    def with_tapes(self, *names: str) -> Scene:
+        """The same with the tapes of these names only."""
+        kept = tuple(line for line in self.line_map if line.name in names)
+        return dataclasses.replace(self, line_map=LineMap(kept))
+
+    def with_things(
+        self, obstacles: Iterable[Obstacle], patches: Iterable[Line] = (),
+    ) -> Scene:
+        """The same with more things that stand about and more patches on the floor."""
+        look = self.appearance
+        look = dataclasses.replace(
+            look, obstacles=(*look.obstacles, *obstacles), patches=(*look.patches, *patches))
+        return dataclasses.replace(self, appearance=look)
+
+    def with_parallel_tapes(self) -> Scene:
+        """The arena with its northern tape turned until it is exactly parallel to the southern."""
+        south, east, north, west = self.line_map
+        half = 0.5 * north.length * south.direction
+        middle = 0.5 * (north.start + north.end)
+        turned = dataclasses.replace(north, start=middle + half, end=middle - half)
+        return dataclasses.replace(self, line_map=LineMap((south, east, turned, west)))
 
 
 def arena_rig() -> Rig:

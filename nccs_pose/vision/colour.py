@@ -21,7 +21,7 @@ import math
 
 from nccs_pose.errors import VisionError
 from nccs_pose.geometry.pose import Array
-from nccs_pose.geometry.small_matrices import solution
+from nccs_pose.geometry.small_matrices import solve_symmetric
 from nccs_pose.vision.median import upper_median
 import numpy as np
 
@@ -78,7 +78,7 @@ class LineColour:
     @classmethod
     def of(cls, name: str, contrast: Array, clutter: Array, blur: float) -> LineColour:
         """A contrast (3,) that is told from clutter (3, 3)."""
-        weights = solution(clutter, contrast)
+        weights = solve_symmetric(clutter, contrast)
         return cls(name, contrast, clutter, blur, weights / float(weights.dot(contrast)))
 
     @classmethod

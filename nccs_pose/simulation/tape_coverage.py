@@ -63,7 +63,7 @@ def tape_coverage(view: FloorView, tape: Line) -> tuple[np.ndarray, np.ndarray]:
     :returns: positions among the view's floor pixels (K,) int and coverage (K,) float64.
     """
     start, along = tape.start[:2], tape.direction[:2]
-    left = np.array([-along[1], along[0]])
+    left = tape.left[:2]
     half, length = 0.5 * tape.width, tape.length
     index = _near_blocks(view, start, along, length, half)
     if not len(index):
