@@ -208,7 +208,7 @@ def _what_is_missing(measured: Measured) -> str:
     if measured.seen == 0:
         return 'there is no image to calibrate from'
     if not measured.reasons:
-        return (f'too few images to calibrate from: {measured.seen}, of which {_usable(measured)} '
+        return (f'too few images to calibrate from: {measured.seen}, of which {measured.usable} '
                 f'show {LEAST_LINES} lines or more')
     reason, count = measured.reasons.most_common(1)[0]
     return (f'the lines could not be followed in {measured.seen} images (in {count}: {reason}); '
