@@ -38,8 +38,10 @@ _PER_METRE = (0.03, 0.03)
 _YAW_PER_RADIAN = 0.05
 # Besides, they may be larger or smaller than they are taken for, by this part.
 _SCALE = 0.02
-# Where no image watches them they may slip or spin by this part.
+# Where no image watches them they may slip or spin by this part; one alone of two that are so far
+# apart, metres, turns the robot by it.
 _SLIP = 0.1
+_APART = 0.4
 # Without odometry: the speed and the acceleration that a robot may have, m/s and rad/s, a second.
 SPEED = (1.0, 2.0)
 _ACCELERATION = (1.0, 2.0)
@@ -162,7 +164,8 @@ def by_odometry(
 
     They err by the whole of their way, also where it leads back: by chance, which adds up in
     squares, and by their size, which adds up as it is. A leap of theirs may be no motion at all:
-    it counts in full, and its turn swings all of the way.
+    it counts in full, and its turn swings all of the way. What they roll too far lies along a
+    straight way, and where they swerve leads across it; of a way that bends both lie anywhere.
 
     :param seen_way: how far they had rolled when the pose was last fixed in every direction,
         metres; None for when they were asked first.
@@ -177,16 +180,23 @@ def by_odometry(
     open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
     scale = max(flaw.way, _SCALE) * math.sqrt(distance * (distance + 2.0 * open_way))
     leap, spin = (b - a for a, b in zip(before.leapt, after.leapt))
-    slipped = math.sqrt(slip.variance(open_way + distance) - slip.variance(open_way))
+    slipped = slip.variance(open_way + distance) - slip.variance(open_way)
     swerve = math.hypot(
-        max(flaw.turn * angle, flaw.bend * distance), math.sqrt(slip.variance(angle)))
-    sigma = math.hypot(
-        _PER_METRE[0] * math.sqrt(distance), scale, slipped, faster, leap, spin * distance,
-        0.5 * swerve * distance)
+        max(flaw.turn * angle, flaw.bend * distance),
+        math.sqrt(slip.variance(angle) + slip.variance(distance) / _APART**2))
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin,
         swerve)
-    return Prediction(moved, _carried(pose, covariance, moved, sigma, sigma_yaw), True)
+    anywhere = _PER_METRE[0] ** 2 * distance + faster**2 + leap**2
+    rolled = scale**2 + slipped
+    swung = (spin**2 + 0.25 * swerve**2) * distance**2
+    # Of the way, what leads from the one pose straight to the other.
+    x, y = ((b - a) / max(distance, 1e-9) for a, b in ((pose.x, moved.x), (pose.y, moved.y)))
+    anywhere += max(1.0 - x * x - y * y, 0.0) * (rolled + swung)
+    place = (
+        anywhere + x * x * rolled + y * y * swung, x * y * (rolled - swung),
+        anywhere + y * y * rolled + x * x * swung)
+    return Prediction(moved, _carried(pose, covariance, moved, place, sigma_yaw), True)
 
 
 def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction | None:
@@ -203,7 +213,7 @@ def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction
     if not past:
         sigma, sigma_yaw = (speed * blind for speed in SPEED)
         return Prediction(last.pose, _carried(
-            last.pose, last.covariance, last.pose, sigma, sigma_yaw), False)
+            last.pose, last.covariance, last.pose, (sigma**2, 0.0, sigma**2), sigma_yaw), False)
     tracks = (*past[-PAST:], last)
     seconds = [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairwise(tracks)]
     before = seconds[-1]
@@ -220,7 +230,8 @@ def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction
     moved = last.pose @ Pose2(*(dt * velocity).tolist())
     sigma, sigma_yaw = (0.5 * a * blind * (blind + before) for a in _ACCELERATION)
     return Prediction(
-        moved, _carried(last.pose, last.covariance, moved, sigma, sigma_yaw), False)
+        moved, _carried(
+            last.pose, last.covariance, moved, (sigma**2, 0.0, sigma**2), sigma_yaw), False)
 
 
 def _step(before: Pose2, after: Pose2) -> Array:
@@ -253,15 +264,20 @@ def _going_on(first: Array, second: Array) -> Array:
 
 
 def _carried(
-    pose: Pose2, covariance: Array, moved: Pose2, sigma: float, sigma_yaw: float,
+    pose: Pose2, covariance: Array, moved: Pose2, place: tuple[float, float, float],
+    sigma_yaw: float,
 ) -> Array:
-    """Covariance (3, 3) of a pose moved on: an error in yaw swings the step sideways."""
+    """Covariance (3, 3) of a pose moved on: an error in yaw swings the step sideways.
+
+    :param place: what the step adds to the covariance of (x, y): xx, xy and yy, m^2.
+    :param sigma_yaw: of what it adds to the yaw, rad.
+    """
     # How the place goes as the yaw does.
     a, b = pose.y - moved.y, moved.x - pose.x
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
     across_x, across_y = xt + a * tt, yt + b * tt
-    mixed = xy + a * yt + b * across_x
+    mixed = xy + a * yt + b * across_x + place[1]
     return np.array([
-        [xx + a * (xt + across_x) + sigma**2, mixed, across_x],
-        [mixed, yy + b * (yt + across_y) + sigma**2, across_y],
+        [xx + a * (xt + across_x) + place[0], mixed, across_x],
+        [mixed, yy + b * (yt + across_y) + place[2], across_y],
         [across_x, across_y, tt + sigma_yaw**2]])
