@@ -187,9 +187,8 @@ def by_odometry(
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin,
         swerve)
-    anywhere = _PER_METRE[0] ** 2 * distance + faster**2 + leap**2
-    rolled = scale**2 + slipped
-    swung = (spin**2 + 0.25 * swerve**2) * distance**2
+    anywhere = _PER_METRE[0] ** 2 * distance + faster**2 + leap**2 + (spin * distance) ** 2
+    rolled, swung = scale**2 + slipped, (0.5 * swerve * distance) ** 2
     # Of the way, what leads from the one pose straight to the other.
     x, y = ((b - a) / max(distance, 1e-9) for a, b in ((pose.x, moved.x), (pose.y, moved.y)))
     anywhere += max(1.0 - x * x - y * y, 0.0) * (rolled + swung)

@@ -36,6 +36,9 @@ from rclpy.qos import QoSProfile
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # So begins a shell's background job, and so would the programs that it starts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    # So does what nohup starts.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PATIENCE = 90.0
