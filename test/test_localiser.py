@@ -45,7 +45,7 @@ from nccs_pose.files.yaml_files import load_map
 from nccs_pose.geometry.floor_table import FloorTable
 from nccs_pose.geometry.lines import Line, LineMap
 from nccs_pose.geometry.pose import Pose2, RigidTransform, wrap_angle
-from nccs_pose.simulation.large_maps import lattice
+from nccs_pose.simulation.large_maps import lattice, parking_bays
 from nccs_pose.simulation.motion import figure_of_eight
 from nccs_pose.simulation.renderer import render
 from nccs_pose.simulation.scene import arena_scene, ideal_scene, Scene
@@ -732,6 +732,18 @@ def test_a_slip_in_the_dark_does_not_end_in_the_next_cell(slip: float) -> None:
     for _ in range(4):
         back = drive.go(step)
         assert back.pose is None or drive.right(back)
+
+
+def test_what_images_leave_open_along_lines_leaves_nothing_open_across_them() -> None:
+    """A robot that has long seen parallel lines alone knows on which of them it is."""
+    step = Pose2(0.2, 0.0, 0.0)
+    drive = Drive(_plain(parking_bays()), Pose2(-3.0, 0.1, 0.02))
+    drive.localiser.set_prior(drive.pose @ step, np.diag([0.05, 0.05, 0.05]) ** 2)
+    for dark in 12 * [False] + 5 * [True] + 2 * [False]:
+        answer = drive.go(step, change=_black) if dark else drive.go(step)
+        if not dark:
+            assert answer.state is State.TRACKING
+            assert drive.error(answer)[0] == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize('leap', [

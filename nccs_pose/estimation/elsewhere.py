@@ -99,7 +99,7 @@ class Elsewhere:
         gate = Gate(prediction.pose, prediction.covariance, sigmas)
         found = self._searcher.candidates(segments, gate if vague else None)
         better = (c for c in found.fitted if c.score > here + BETTER)
-        if self._explains_more(image, alignment, claimed, islice(better, _TRIED)):
+        if self._explains_more(image, alignment, claimed, better):
             return Refused(_ANOTHER, alignment)
         if vague and (self._shows_as_much(found, alignment, here, gate)
                       or self._is_one_of_parallels(image, alignment, prediction, gate)):
@@ -119,9 +119,9 @@ class Elsewhere:
         :param claimed: which part of the strips the pose itself explains.
         """
         least = min(claimed, alignment.explained) + BETTER
-        for candidate in others:
-            if candidate.claimed <= least or same_pose(candidate.pose, alignment.pose):
-                continue
+        promising = (c for c in others
+                     if c.claimed > least and not same_pose(c.pose, alignment.pose))
+        for candidate in islice(promising, _TRIED):
             other = self._aligner.align(
                 image, candidate.pose, alignment.colours, reach=SEARCH_BAND)
             if other is not None and other.explained > least and not same_pose(

@@ -180,10 +180,10 @@ def by_odometry(
     open_way = 0.0 if seen_way is None else max(before.way - seen_way, 0.0)
     scale = max(flaw.way, _SCALE) * math.sqrt(distance * (distance + 2.0 * open_way))
     leap, spin = (b - a for a, b in zip(before.leapt, after.leapt))
-    slipped = slip.variance(open_way + distance) - slip.variance(open_way)
+    slipped = slip.variance(distance)
     swerve = math.hypot(
         max(flaw.turn * angle, flaw.bend * distance),
-        math.sqrt(slip.variance(angle) + slip.variance(distance) / _APART**2))
+        math.sqrt(slip.variance(angle) + slipped / _APART**2))
     sigma_yaw = math.hypot(
         _PER_METRE[1] * math.sqrt(distance), _YAW_PER_RADIAN * math.sqrt(angle), faster_yaw, spin,
         swerve)
@@ -195,7 +195,25 @@ def by_odometry(
     place = (
         anywhere + x * x * rolled + y * y * swung, x * y * (rolled - swung),
         anywhere + y * y * rolled + x * x * swung)
-    return Prediction(moved, _carried(pose, covariance, moved, place, sigma_yaw), True)
+    carried = _carried(pose, covariance, moved, place, sigma_yaw)
+    if open_way > 0.0:
+        carried[:2, :2] += _slipping_on(covariance[:2, :2], slip, open_way, distance)
+    return Prediction(moved, carried, True)
+
+
+def _slipping_on(place: Array, slip: Slip, open_way: float, distance: float) -> Array:
+    """What a slip that began before a step adds to the place's covariance (2, 2) on the step.
+
+    It goes on only where images have left open how much it was: across lines that are in view
+    every image says anew how far the robot has come.
+
+    :param place: its covariance (2, 2) before the step.
+    """
+    before = slip.variance(open_way)
+    more = slip.variance(open_way + distance) - before - slip.variance(distance)
+    variance, axes = np.linalg.eigh(place)
+    left_open = np.clip(variance / max(before, 1e-12), 0.0, 1.0)
+    return (more * left_open * axes).dot(axes.T)
 
 
 def by_velocity(past: Sequence[Track], last: Track, stamp_ns: int) -> Prediction | None:
