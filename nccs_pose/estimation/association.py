@@ -187,7 +187,7 @@ def _likenesses(line_map: LineMap, seen: SeenMap) -> tuple[Pose2, ...]:
     the candidates anyway.
     """
     tapes = tuple(FloorSegment(
-        np.array([-line.direction[1], line.direction[0]]), 0.0, line.start[:2], line.end[:2],
+        line.left[:2], 0.0, line.start[:2], line.end[:2],
         line.length, _ASKEW, np.zeros((0, 2)), line.colour) for line in line_map)
     scorer = StripScorer(tuple(sorted(tapes, key=lambda tape: -tape.weight)), seen)
     poses = poses_of_pairs(scorer.strips, seen.lines, _PAIRS)

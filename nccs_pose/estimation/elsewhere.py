@@ -175,9 +175,8 @@ class Elsewhere:
 
     def _steps_across(self, line: int) -> Array:
         """What lays a map's lines on parallel ones of their colour (K, 2), metres, least first."""
-        direction = self._map.directions[line]
-        normal = np.array([-direction[1], direction[0]])
-        parallel = parallel_to(direction, self._map.directions)
+        normal = self._map[line].left[:2]
+        parallel = parallel_to(self._map[line].direction, self._map.directions)
         parallel &= np.array([other.colour == self._map[line].colour for other in self._map])
         across = self._map.starts[parallel, :2] @ normal
         steps = np.unique(np.round((across[:, None] - across) / _APART)) * _APART

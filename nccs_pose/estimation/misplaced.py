@@ -225,7 +225,7 @@ class LineFinder:
             direction = line.direction[:2]
             offset = at - line.start[:2]
             along = offset @ direction
-            across = np.abs(offset @ np.array([-direction[1], direction[0]]))
+            across = np.abs(offset @ line.left[:2])
             on = (across < _ON_ANOTHER + footprint) & (along > 0.0) & (along < line.length)
             if on.mean() > 0.5:
                 return True

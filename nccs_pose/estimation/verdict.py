@@ -200,7 +200,7 @@ def _beside(strip: FloorSegment, pose: Pose2, line: Line) -> float | None:
     if sine > np.sin(_PARALLEL) or strip.colour != line.colour:
         return None
     offset = ends - line.start[:2]
-    across = float(np.mean(offset @ np.array([-direction[1], direction[0]])))
+    across = float(np.mean(offset @ line.left[:2]))
     middle = float(np.mean(offset @ direction))
     inside = -_NEAR < middle < line.length + _NEAR
     return abs(across) if inside and abs(across) < _NEAR else None
